@@ -59,22 +59,23 @@ LEFT_BY = {
     },
 }
 """Pictures that are those of a run, by its command."""
+_SWEEP = ("matcher/sweep/figures", "render/charts.py")
 SOURCES = {
-    "accuracy-bearing.png": ("matcher/sweep/plans/robustness.toml", "matcher/sweep/figures"),
-    "accuracy-distance.png": ("matcher/sweep/plans/paper.toml", "matcher/sweep/figures"),
-    "accuracy-frames.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
-    "accuracy-map.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
-    "accuracy-models.png": ("matcher/sweep/plans/robustness.toml", "matcher/sweep/figures"),
-    "accuracy-noise.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
-    "accuracy-position.png": ("matcher/sweep/plans/paper.toml", "matcher/sweep/figures"),
-    "accuracy-risk.png": ("matcher/sweep/plans/distance-angle-noise.toml", "matcher/sweep/figures"),
+    "accuracy-bearing.png": ("matcher/sweep/plans/robustness.toml", *_SWEEP),
+    "accuracy-distance.png": ("matcher/sweep/plans/paper.toml", *_SWEEP),
+    "accuracy-frames.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),
+    "accuracy-map.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),
+    "accuracy-models.png": ("matcher/sweep/plans/robustness.toml", *_SWEEP),
+    "accuracy-noise.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),
+    "accuracy-position.png": ("matcher/sweep/plans/paper.toml", *_SWEEP),
+    "accuracy-risk.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),
     "cost.png": ("docs/figures.py",),
     "demo.png": ("docs/figures.py", "landmarks/catalog.py", "landmarks/figures.py", "render/figures.py"),
-    "design-bound.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
-    "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py"),
+    "design-bound.png": ("matcher/design/plan.toml", "matcher/design/figures.py", "render/charts.py"),
+    "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py", "render/charts.py"),
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),
-    "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py"),
+    "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py", "render/charts.py"),
 }
 """What decides how a figure looks, beside the physics: plans, and the code that draws."""
 RECORD = IMAGES / "drawn.json"

@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, background_image, phasor_to_range_m, predicted_range_std
+from phasemark.render.charts import panels
 from phasemark.render.direct.chip_renderer import ChipRenderer
 from phasemark.render.figures import draw_range, draw_sigma, landmark_limits_m
 from phasemark.render.phasor_images import wrap_difference_m
@@ -42,13 +44,7 @@ def model_image(
         mesh = bank.mesh(name)
         made_by = ChipRenderer if reported else Renderer
         rendered = made_by(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"])).render(
-            match.distance_m,
-            match.delta_rad,
-            match.bearing_rad,
-            match.height_m,
-            match.pitch_rad,
-            match.roll_rad,
-            background=match.background or background,
+            *(getattr(match, name) for name in VIEW), background=match.background or background
         )
         counted = counts(rendered.phasor[0], rendered.intensity[0], bank.sensor)
         return np.where(counted, rendered.range_m[0], np.nan), rendered.coverage[0]
@@ -105,8 +101,7 @@ def match_figure(
     if math.isfinite(match.distance_m):
         model, coverage = model_image(bank, match, background, reported=reported)
     near, far = landmark_limits_m(model, coverage)
-    figure = Figure(figsize=(13.2, 4.2), layout="constrained")
-    left, middle, right = figure.subplots(1, 3)
+    figure, ((left, middle, right),) = panels(3, width=4.4, height=4.2)
     left.set_title("measured, filtered")
     draw_range(left, measured, near_m=near, far_m=far)
     middle.set_title("best model image")

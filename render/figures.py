@@ -202,10 +202,7 @@ def draw_sigma(axes: Axes, residual: NDArray[np.float64]) -> AxesImage:
     -------
     matplotlib.image.AxesImage
     """
-    axes.set_facecolor("#d0d0d0")
-    image = _draw_pixels(axes, residual, cmap="RdBu", vmin=-SIGMA_SPAN, vmax=SIGMA_SPAN)
-    _colour_bar(axes, image, "residual (σ)")
-    return image
+    return _draw_residual(axes, residual, SIGMA_SPAN, "residual (σ)")
 
 
 def draw_difference(axes: Axes, difference_m: NDArray[np.float64], *, span_mm: float | None = None) -> AxesImage:
@@ -225,9 +222,13 @@ def draw_difference(axes: Axes, difference_m: NDArray[np.float64], *, span_mm: f
     """
     known = 1e3 * np.abs(difference_m[np.isfinite(difference_m)])
     span = max(float(np.percentile(known, 90)) if known.size else 1.0, 1.0) if span_mm is None else span_mm
+    return _draw_residual(axes, 1e3 * difference_m, span, "difference (mm)")
+
+
+def _draw_residual(axes: Axes, values: NDArray[np.float64], span: float, label: str) -> AxesImage:
     axes.set_facecolor("#d0d0d0")
-    image = _draw_pixels(axes, 1e3 * difference_m, cmap="RdBu", vmin=-span, vmax=span)
-    _colour_bar(axes, image, "difference (mm)")
+    image = _draw_pixels(axes, values, cmap="RdBu", vmin=-span, vmax=span)
+    _colour_bar(axes, image, label)
     return image
 
 
@@ -244,7 +245,7 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    index = _checked("view", index, len(images))
+    check_index("view", index, len(images))
     figure = Figure(figsize=(12.4, 4.0), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     left.set_title("range")
@@ -287,8 +288,8 @@ def frame_figure(
     -------
     matplotlib.figure.Figure
     """
-    index = _checked("position", index, len(frames))
-    frame = _checked("frame", frame, frames.n_frames)
+    check_index("position", index, len(frames))
+    check_index("frame", frame, frames.n_frames)
     n_panels = 2 if frames.amplitude_e is None else 3
     figure = Figure(figsize=(0.4 + 4.0 * n_panels, 4.0), layout="constrained")
     panels = figure.subplots(1, n_panels)
@@ -379,21 +380,26 @@ def _limits(range_m: NDArray[np.float64], near_m: float | None, far_m: float | N
     return near, max(far, near + 1e-3)  # a flat image still needs two ends to its colour bar
 
 
-def _checked(what: str, index: int, count: int) -> int:
+def check_index(what: str, index: int, count: int) -> None:
+    """Refuse the number of a view, position or frame that there is not."""
     if not 0 <= index < count:
         raise UsageError(f"there is no {what} {index}: they count from 0 to {count - 1}")
-    return index
 
 
 def _draw_pixels(axes: Axes, values: NDArray[np.generic], **how: object) -> AxesImage:
     """Draw an image in the coordinates of PHYSICS section 2, where pixel (r, c) covers u ∈ [c, c+1], v ∈ [r, r+1]."""
     rows, cols = values.shape
     image = axes.imshow(values, extent=(0, cols, rows, 0), interpolation="nearest", **how)  # type: ignore[arg-type]
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 4, 5, 10]))
+    whole_ticks(axes)
     axes.set_xlabel("u (pixel columns)")
     axes.set_ylabel("v (pixel rows)")
     return image
+
+
+def whole_ticks(axes: Axes) -> None:
+    """Put a few whole numbers on both axes of an image."""
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 4, 5, 10]))
 
 
 def draw_map(axes: Axes, values: NDArray[np.float64], title: str, label: str, **how: object) -> None:
@@ -415,13 +421,8 @@ def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:
     names = list(_FLAG_COLOURS)
     kind = np.zeros(flags.shape, dtype=np.int64)
     # Later entries say more about the cause, so they win.
-    for flag, name in (
-        (Flag.NO_RETURN, "no return"),
-        (Flag.MISSING, "missing"),
-        (Flag.SATURATED, "saturated"),
-        (Flag.DEAD, "dead"),
-    ):
-        kind[(flags & int(flag)) != 0] = names.index(name)
+    for number, flag in enumerate((Flag.NO_RETURN, Flag.MISSING, Flag.SATURATED, Flag.DEAD), 1):
+        kind[(flags & int(flag)) != 0] = number
     norm = BoundaryNorm(np.arange(len(names) + 1) - 0.5, len(names))
     _draw_pixels(axes, kind, cmap=ListedColormap(list(_FLAG_COLOURS.values())), norm=norm)
     axes.set_title("flags")
@@ -435,13 +436,8 @@ _LABEL_POINTS = 36.0
 
 def _legend_below(axes: Axes, handles: list[Patch]) -> None:
     """Put a legend below the label of the axis, whatever the image's shape."""
+    below = offset_copy(axes.transAxes, fig=axes.get_figure(root=True), y=-_LABEL_POINTS, units="points")
     axes.legend(
-        handles=handles,
-        loc="upper center",
-        bbox_to_anchor=(0.5, 0.0),
-        bbox_transform=offset_copy(axes.transAxes, fig=axes.get_figure(root=True), y=-_LABEL_POINTS, units="points"),
-        ncols=len(handles),
-        frameon=False,
-        fontsize="small",
-        borderaxespad=0.0,
-    )
+        handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), bbox_transform=below, ncols=len(handles),
+        frameon=False, fontsize="small", borderaxespad=0.0,
+    )  # fmt: skip

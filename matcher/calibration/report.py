@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from phasemark.matcher.calibration.result import Calibration
+from phasemark.render.charts import explain, panels
 from phasemark.render.figures import draw_difference
 
 _SIGMAS, _BINS = 5.0, 50
@@ -26,8 +27,7 @@ def residual_figure(found: Calibration) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    figure = Figure(figsize=(11.6, 9.2), layout="constrained")
-    (before, after), (by_pose, density) = figure.subplots(2, 2)
+    figure, ((before, after), (by_pose, density)) = panels(2, 2, width=5.8, height=4.6)
     means = [_mean_of_pixels(one, found.range_std_m) for one in (found.residual_before_m, found.residual_m)]
     span_mm = max(1e3 * float(np.nanpercentile(np.abs(means), 90)), 1.0)
     for axes, mean, residual, title in (
@@ -54,19 +54,11 @@ def _draw_poses(axes: Any, found: Calibration) -> None:
     x, count = found.poses.distance_m[told][order], n[told][order]
     low, high = (np.sqrt(stats.chi2.ppf(q, count) / count) for q in (0.025, 0.975))
     axes.vlines(x, low, high, color="0.85", lw=5, label="95 % of poses, if noise is all")
-    points = axes.scatter(
-        x,
-        size[told][order],
-        c=np.degrees(np.angle(np.exp(1j * found.poses.bearing_rad[told][order]))),
-        cmap="coolwarm",
-        edgecolor="0.3",
-        zorder=3,
-    )
+    bearing_deg = np.degrees(np.angle(np.exp(1j * found.poses.bearing_rad[told][order])))
+    points = axes.scatter(x, size[told][order], c=bearing_deg, cmap="coolwarm", edgecolor="0.3", zorder=3)
     axes.figure.colorbar(points, ax=axes, label="bearing (°)")
-    axes.set(xlabel="distance (m)", ylabel="r.m.s. residual of a pose (σ)", title="poses")
     axes.set_ylim(0, max(2.0, float(size.max(initial=0.0)) * 1.1))
-    axes.legend(frameon=False, fontsize="small", loc="upper left")
-    axes.grid(alpha=0.3)
+    explain(axes, "distance (m)", "r.m.s. residual of a pose (σ)", "poses", legend="upper left")
 
 
 def _draw_density(axes: Any, found: Calibration) -> None:
@@ -76,20 +68,13 @@ def _draw_density(axes: Any, found: Calibration) -> None:
     inside = sigma[np.abs(sigma) < _SIGMAS]
     beyond = 1 - len(inside) / max(len(sigma), 1)
     if len(inside):
-        axes.hist(
-            inside,
-            bins=_BINS,
-            range=(-_SIGMAS, _SIGMAS),
-            weights=np.full(len(inside), _BINS / (2 * _SIGMAS) / len(sigma)),
-            color="#9ecae1",
-            label=f"{len(sigma)} range residuals, {100 * beyond:.2g} % beyond {_SIGMAS:g} σ",
-        )
+        weights = np.full(len(inside), _BINS / (2 * _SIGMAS) / len(sigma))
+        label = f"{len(sigma)} range residuals, {100 * beyond:.2g} % beyond {_SIGMAS:g} σ"
+        axes.hist(inside, bins=_BINS, range=(-_SIGMAS, _SIGMAS), weights=weights, color="#9ecae1", label=label)
     x = np.linspace(-_SIGMAS, _SIGMAS, 201)
     axes.plot(x, stats.norm.pdf(x), color="0.3", lw=1, label="normal law")
-    axes.set(xlabel="residual of a filtered range (σ)", ylabel="density", title="pixels")
     axes.set_ylim(0, 0.55)
-    axes.legend(frameon=False, fontsize="small", loc="upper left")
-    axes.grid(alpha=0.3)
+    explain(axes, "residual of a filtered range (σ)", "density", "pixels", legend="upper left")
 
 
 def _mean_of_pixels(residual_m: NDArray[np.float64], std_m: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -2,33 +2,36 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
-from phasemark.matcher.design.output import (
-    landmarks_toml,
-    mesh_stl,
-    output_names,
-    pareto_csv,
-    pareto_rows,
-    summary,
-    write_design,
-)
-from phasemark.matcher.design.plan import (
-    DesignPlan,
-    LimitsPlan,
-    SamplingPlan,
-    SearchPlan,
-    default_design,
-    example_design,
-    read_design_plan,
-)
-from phasemark.matcher.design.position_bound import RangeBound, range_bound
-from phasemark.matcher.design.rules import AllowedDimensions, Check
-from phasemark.matcher.design.run import run_design
-from phasemark.matcher.design.search import Candidate, Design, Scored
-from phasemark.matcher.design.separation import ClassDistances, choose_far_apart, turn_distance
+from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
+    from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
     from phasemark.matcher.design.figures import bound_figure, pareto_figure
+    from phasemark.matcher.design.output import (
+        landmarks_toml,
+        mesh_stl,
+        output_names,
+        pareto_csv,
+        pareto_rows,
+        summary,
+        write_design,
+    )
+    from phasemark.matcher.design.plan import (
+        DesignPlan,
+        LimitsPlan,
+        SamplingPlan,
+        SearchPlan,
+        default_design,
+        example_design,
+        read_design_plan,
+    )
+    from phasemark.matcher.design.position_bound import RangeBound, range_bound
+    from phasemark.matcher.design.rules import AllowedDimensions, Check
+    from phasemark.matcher.design.run import run_design
+    from phasemark.matcher.design.search import Candidate, Design, Scored
+    from phasemark.matcher.design.separation import ClassDistances, choose_far_apart, turn_distance
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
 
 __all__ = [
     "AllowedDimensions",
@@ -63,12 +66,3 @@ __all__ = [
     "turn_distance",
     "write_design",
 ]
-
-
-def __getattr__(name: str) -> object:
-    """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name in ("bound_figure", "pareto_figure"):
-        from phasemark.matcher.design import figures
-
-        return getattr(figures, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

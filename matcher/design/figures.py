@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from phasemark.matcher.design.confirm import Confirmation
 from phasemark.matcher.design.search import Candidate, Design, Scored
+from phasemark.render.charts import explain, logarithmic, panels, with_intervals
 
 _NEW, _OLD, _GREY, _FRONT = "#2a6fbb", "#c8553d", "#b9bec4", "#1a1a1a"
 _INFINITE = 1.15
@@ -28,20 +29,19 @@ def pareto_figure(design: Design) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    figure = Figure(figsize=(12, 5), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = panels(2, width=6, height=5)
     limits = design.plan.limits
     front = design.front()
     known, classes = design.catalogue, design.plan.n_classes > 1
     if classes:
         _scatter(left, design.candidates, [c.class_distance for c in design.candidates])
-        _line_and_points(left, front, [c.class_distance for c in front])
+        x = [1000 * c.bound.worst_m for c in front]
+        left.plot(x, [c.class_distance for c in front], color=_FRONT, lw=1, marker=".", label="Pareto front")
         _mark(left, known, known.class_distance, "catalogue", _OLD)
         _mark(left, design.result, design.result.class_distance, "chosen, its upper parts refined", _NEW)
         left.axhline(limits.least_class_distance, color=_GREY, lw=0.8, ls="--")
     else:
         left.text(0.5, 0.5, "one class: nothing to distinguish", ha="center", transform=left.transAxes)
-    left.set_ylabel("least d between two classes")
     finite = [c.turn_distance for c in design.candidates if np.isfinite(c.turn_distance)]
     top = _INFINITE * max([*finite, known.turn_distance, limits.least_turn_distance])
     _scatter(right, design.candidates, [min(c.turn_distance, top) for c in design.candidates])
@@ -51,19 +51,17 @@ def pareto_figure(design: Design) -> Figure:
     if any(c.symmetry == 4 for c in design.candidates):
         right.annotate("square: δ modulo 90°", (1, top), (-4, 5), xycoords=("axes fraction", "data"),
                        textcoords="offset points", ha="right", fontsize=8)  # fmt: skip
-    right.set_ylabel("d from itself a quarter-turn on")
     worst = [1000 * c.bound.worst_m for c in design.candidates if np.isfinite(c.bound.worst_m)]
     ends = 1000 * min(design.result.bound.worst_m, *worst), 1000 * known.bound.worst_m
-    for axes in (left, right):
-        axes.set_xlabel("worst position bound over the range (mm)")
+    near, far = design.plan.distance_m
+    conditions = f"{design.plan.n_classes} classes, {near:g} … {far:g} m, lower pixels, {design.plan.n_frames} frames"
+    for axes, y, title in (
+        (left, "least d between two classes", conditions),
+        (right, "d from itself a quarter-turn on", "dashed: least d that the plan allows"),
+    ):
         axes.set_xlim(0.93 * ends[0], max(1.15 * ends[1], float(np.quantile(worst, 0.8))))
         axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8, loc="lower right")
-    near, far = design.plan.distance_m
-    left.set_title(
-        f"{design.plan.n_classes} classes, {near:g} … {far:g} m, lower pixels, {design.plan.n_frames} frames"
-    )
-    right.set_title("dashed: least d that the plan allows")
+        explain(axes, "worst position bound over the range (mm)", y, title, grid=None, legend="lower right")
     return figure
 
 
@@ -75,10 +73,6 @@ def _scatter(axes: Axes, candidates: Sequence[Candidate], y: Sequence[float]) ->
                 shape = "square" if square else "oblong"
                 x = [1000 * candidates[k].bound.worst_m for k in some]
                 axes.scatter(x, [y[k] for k in some], s=18, c=colour, marker=marker, label=f"{shape}, {words}", lw=0)
-
-
-def _line_and_points(axes: Axes, front: Sequence[Candidate], y: Sequence[float]) -> None:
-    axes.plot([1000 * c.bound.worst_m for c in front], y, color=_FRONT, lw=1, marker=".", label="Pareto front")
 
 
 def _mark(axes: Axes, scored: Scored, y: float, words: str, colour: str) -> None:
@@ -99,8 +93,7 @@ def bound_figure(design: Design, confirmed: tuple[Confirmation, Confirmation] | 
     -------
     matplotlib.figure.Figure
     """
-    figure = Figure(figsize=(12, 4.6), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = panels(2, width=6, height=4.6)
     for k, (scored, words, colour) in enumerate(
         ((design.result, "new set", _NEW), (design.catalogue, "catalogue", _OLD))
     ):
@@ -114,19 +107,14 @@ def bound_figure(design: Design, confirmed: tuple[Confirmation, Confirmation] | 
         if confirmed is None:
             continue
         trial = confirmed[k].sides
-        rmse = [trial.rmse(i) for i in range(len(trial.error_m))]
-        value = 1000 * np.array([one.value for one in rmse])
-        reach = 1000 * np.array([[one.value - one.low for one in rmse], [one.high - one.value for one in rmse]])
-        right.errorbar(np.degrees(trial.delta_rad[:, 0]), value, reach, fmt="o", ms=4, lw=1, color=colour,
-                       label=f"{words}, r.m.s. error of {trial.error_m.shape[1]} frame sets, 95 %")  # fmt: skip
-    left.set_yscale("log")
-    left.set_xlabel("distance D (m)")
-    left.set_ylabel("position bound (mm)")
-    right.set_xlabel("side δ (°)")
-    right.set_ylabel(f"position at D = {design.result.bound.worst_view[0]:.3g} m (mm)")
+        rmse = [trial.rmse(i).scaled(1000) for i in range(len(trial.error_m))]
+        label = f"{words}, r.m.s. error of {trial.error_m.shape[1]} frame sets, 95 %"
+        look = {"color": colour, "marker": "o", "markersize": 4, "linestyle": "none", "linewidth": 1}
+        with_intervals(right, np.degrees(trial.delta_rad[:, 0]), rmse, label=label, **look)
+    logarithmic(left.yaxis)
     right.set_ylim(bottom=0)
-    for axes in (left, right):
-        axes.legend(fontsize=8)
-        axes.grid(alpha=0.25)
-    left.set_title("Cramér–Rao bound of the lens's position, lower pixels")
+    title = "Cramér–Rao bound of the lens's position, lower pixels"
+    explain(left, "distance D (m)", "position bound (mm)", title, legend="best")
+    worst_m = design.result.bound.worst_view[0]
+    explain(right, "side δ (°)", f"position at D = {worst_m:.3g} m (mm)", legend="best")
     return figure

@@ -2,22 +2,25 @@
 
 from typing import TYPE_CHECKING
 
-from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, write_drive
-from phasemark.matcher.drive.plan import (
-    CameraPlan,
-    DrivePlan,
-    OdometryPlan,
-    PathPlan,
-    StopPlan,
-    default_drive,
-    example_drive,
-    read_drive_plan,
-)
-from phasemark.matcher.drive.pose_filter import PoseFilter
-from phasemark.matcher.drive.simulate import Drive, RobotEquipment, Stop, pose_error, run_drive
+from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
     from phasemark.matcher.drive.figures import drive_figure
+    from phasemark.matcher.drive.output import OUTPUTS, path_csv, stops_csv, write_drive
+    from phasemark.matcher.drive.plan import (
+        CameraPlan,
+        DrivePlan,
+        OdometryPlan,
+        PathPlan,
+        StopPlan,
+        default_drive,
+        example_drive,
+        read_drive_plan,
+    )
+    from phasemark.matcher.drive.pose_filter import PoseFilter
+    from phasemark.matcher.drive.simulate import Drive, RobotEquipment, Stop, pose_error, run_drive
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
 
 __all__ = [
     "OUTPUTS",
@@ -40,12 +43,3 @@ __all__ = [
     "stops_csv",
     "write_drive",
 ]
-
-
-def __getattr__(name: str) -> object:
-    """Import pictures when they are asked for: matplotlib takes half a second to load."""
-    if name == "drive_figure":
-        from phasemark.matcher.drive import figures
-
-        return getattr(figures, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from phasemark.landmarks import catalog
+from phasemark.matcher.drive.follow import rotation
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
+from phasemark.render.charts import explain
 
 _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
 _ENLARGED = 10.0
@@ -65,17 +68,11 @@ def _draw_room(axes: Axes, drive: Drive) -> None:
     for landmark in plan.map.landmark:
         box = specs[landmark.class_name].box
         corners = np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * [box.length_m / 2, box.width_m / 2]
-        corners = corners @ _rotation(landmark.yaw_rad).T + landmark.xy_m
+        corners = corners @ rotation(landmark.yaw_rad).T + landmark.xy_m
         axes.add_patch(Polygon(corners, closed=True, fc=_MARK, ec="none"))
-        axes.annotate(
-            f"{landmark.name}: {landmark.class_name}",
-            landmark.xy_m,
-            (0, -13),
-            textcoords="offset points",
-            ha="center",
-            fontsize=8,
-            color=_MARK,
-        )
+        words = f"{landmark.name}: {landmark.class_name}"
+        how: dict[str, Any] = {"textcoords": "offset points", "ha": "center", "fontsize": 8, "color": _MARK}
+        axes.annotate(words, landmark.xy_m, (0, -13), **how)
     everything = np.concatenate([drive.true, drive.dead_reckoned])[:, :2]
     corners = np.array([*plan.map.room_m, *(landmark.xy_m for landmark in plan.map.landmark)])
     low = np.minimum(everything.min(axis=0), corners.min(axis=0)) - 0.25
@@ -89,11 +86,8 @@ def _draw_stop(axes: Axes, stop: Stop) -> None:
     if not stop.used:
         axes.plot(*stop.true[:2], "x", color=_DEAD, ms=7, zorder=5)
         return
-    for pose, covariance, width in (
-        (stop.before, stop.covariance_before, 0.8),
-        (stop.after, stop.covariance_after, 1.4),
-    ):
-        axes.add_patch(_ellipse(pose, covariance, width))
+    axes.add_patch(_ellipse(stop.before, stop.covariance_before, 0.8))
+    axes.add_patch(_ellipse(stop.after, stop.covariance_after, 1.4))
     axes.add_patch(Circle((float(stop.true[0]), float(stop.true[1])), 0.035, fc=_TRUE, ec="none", zorder=4))
 
 
@@ -107,30 +101,19 @@ def _ellipse(pose: NDArray[np.float64], covariance: NDArray[np.float64], width: 
 
 def _draw_errors(axes: Axes, drive: Drive, *, position: bool) -> None:
     """Draw the errors of dead reckoning and filter over the way, and what the filter thinks of its own."""
-    for pose, color, label in (
-        (drive.dead_reckoned, _DEAD, "dead reckoning"),
-        (drive.corrected, _CORRECTED, "corrected"),
-    ):
+    paths = ((drive.dead_reckoned, _DEAD, "dead reckoning"), (drive.corrected, _CORRECTED, "corrected"))
+    for pose, color, label in paths:
         error = pose_error(pose, drive.true)
         value = 100 * np.hypot(error[:, 0], error[:, 1]) if position else np.degrees(np.abs(error[:, 2]))
         axes.plot(drive.way_m, np.maximum(value, 1e-3), color=color, lw=1.2, label=label)
-    variance = (
-        1e4 * (drive.covariance[:, 0, 0] + drive.covariance[:, 1, 1])
-        if position
-        else np.degrees(1) ** 2 * drive.covariance[:, 2, 2]
-    )
+    x, y, heading = np.einsum("nii->in", drive.covariance)
+    variance = 1e4 * (x + y) if position else np.degrees(1) ** 2 * heading
     axes.plot(drive.way_m, np.sqrt(variance), color=_CORRECTED, lw=0.9, ls=":", label="its own standard deviation")
     for stop in drive.corrections:
         axes.axvline(stop.way_m, color=_MARK, lw=0.7, zorder=0)
     limits = (0.1, 300.0) if position else (0.02, 60.0)
     axes.set(yscale="log", ylim=limits, xlim=(0, float(drive.way_m[-1])))
-    axes.set_ylabel("position error (cm)" if position else "heading error (°)")
     if position:
-        axes.legend(fontsize=7, loc="upper left")
+        explain(axes, "", "position error (cm)", grid=None, legend="upper left")
     else:
-        axes.set_xlabel("way (m); a green line is a correction")
-
-
-def _rotation(angle_rad: float) -> NDArray[np.float64]:
-    cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    return np.array([[cos, -sin], [sin, cos]])
+        explain(axes, "way (m); a green line is a correction", "heading error (°)", grid=None)

@@ -47,7 +47,11 @@ class Path:
         if progress_m > self.length_m:
             along = (self._points[-1] - self._points[-2]) / (self._at[-1] - self._at[-2])
             return np.asarray(self._points[-1] + along * (progress_m - self.length_m))
-        return np.array([np.interp(progress_m, self._at, self._points[:, k]) for k in range(2)])
+        return self._on_path(progress_m)
+
+    def _on_path(self, progress_m: float | NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points of the path, (..., 2)."""
+        return np.stack([np.interp(progress_m, self._at, self._points[:, k]) for k in range(2)], axis=-1)
 
     def advance(self, xy_m: ArrayLike, reach_m: float) -> None:
         """Move the progress to the point nearest to the robot, at most `reach_m` further on.
@@ -58,8 +62,8 @@ class Path:
         reach_m : float
         """
         ahead = np.linspace(self.progress_m, min(self.progress_m + reach_m, self.length_m), 21)
-        points = np.stack([np.interp(ahead, self._at, self._points[:, k]) for k in range(2)], axis=1)
-        self.progress_m = float(ahead[np.linalg.norm(points - np.asarray(xy_m), axis=1).argmin()])
+        distance = np.linalg.norm(self._on_path(ahead) - np.asarray(xy_m), axis=1)
+        self.progress_m = float(ahead[distance.argmin()])
 
     def turn_rate(self, pose: Sequence[float] | NDArray[np.float64], speed_m_s: float, lookahead_m: float) -> float:
         """Return the turn rate of the arc that leads to the point ahead, rad/s: 2 v sin(α) / distance.
@@ -90,7 +94,8 @@ def lens_pose(
     pan_offset_m, lens_offset_m : (2,) array_like
     """
     heading = pose[2] + pan_rad
-    lens = np.asarray(pose[:2]) + _turned(pan_offset_m, pose[2]) + _turned(lens_offset_m, heading)
+    pan_axis = np.asarray(pose[:2]) + rotation(pose[2]) @ np.asarray(pan_offset_m)
+    lens = pan_axis + rotation(heading) @ np.asarray(lens_offset_m)
     return np.array([*lens, math.remainder(heading, math.tau)])
 
 
@@ -135,6 +140,7 @@ def view_of(
     )
 
 
-def _turned(vector: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
+def rotation(angle_rad: float) -> NDArray[np.float64]:
+    """Return the matrix that turns vectors of the plane, (2, 2)."""
     cos, sin = math.cos(angle_rad), math.sin(angle_rad)
-    return np.array([[cos, -sin], [sin, cos]]) @ np.asarray(vector, np.float64)
+    return np.array([[cos, -sin], [sin, cos]])

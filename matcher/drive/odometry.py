@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.drive.follow import rotation
 from phasemark.matcher.drive.plan import OdometryPlan
 
 STATE = ("x_m", "y_m", "heading_rad", "slip", "gyro_bias_rad_s")
@@ -115,8 +116,7 @@ def motion_noise(state: NDArray[np.float64], reading: Reading, model: OdometryMo
     model : OdometryModel
     """
     way = abs(reading.way_m)
-    cos, sin = math.cos(state[2]), math.sin(state[2])
-    axes = np.array([[cos, -sin], [sin, cos]])
+    axes = rotation(state[2])
     noise = np.zeros((5, 5))
     noise[:2, :2] = axes @ np.diag([model.along**2 * way, model.across**2 * way]) @ axes.T
     noise[2, 2] = model.turn**2 * reading.time_s

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data import BankPlan, build_bank
 from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
@@ -130,24 +130,23 @@ class Drive:
     def as_dict(self) -> dict[str, Any]:
         """Return the figures of a drive as plain numbers, for JSON; None where there is nothing to tell."""
         used = self.corrections
-        after = np.array([pose_error(stop.after, stop.true) for stop in used]).reshape(-1, 3)
-        before = np.array([pose_error(stop.before, stop.true) for stop in used]).reshape(-1, 3)
-        consistency = {}
-        for when, errors in (("before", before), ("after", after)):
-            covariances = np.array([getattr(stop, f"covariance_{when}") for stop in used]).reshape(-1, 3, 3)
-            consistency[when] = float(nees(errors, covariances).mean()) / 3 if used else None
-        return {
+        facts: dict[str, Any] = {
             "seed": self.seed,
             "way_m": float(self.way_m[-1]),
             "time_s": float(self.time_s[-1]),
             "stops": len(self.stops),
             "corrections": len(used),
-            "position_rms_after_correction_m": _rms(after[:, :2]) if used else None,
-            "heading_rms_after_correction_deg": math.degrees(_rms(after[:, 2:])) if used else None,
-            "position_rms_before_correction_m": _rms(before[:, :2]) if used else None,
-            "heading_rms_before_correction_deg": math.degrees(_rms(before[:, 2:])) if used else None,
-            "nees_per_dimension_before_correction": consistency["before"],
-            "nees_per_dimension_after_correction": consistency["after"],
+        }
+        consistency = {}
+        for when in ("after", "before"):
+            error = np.array([pose_error(getattr(stop, when), stop.true) for stop in used]).reshape(-1, 3)
+            covariance = np.array([getattr(stop, f"covariance_{when}") for stop in used]).reshape(-1, 3, 3)
+            facts[f"position_rms_{when}_correction_m"] = _rms(error[:, :2]) if used else None
+            facts[f"heading_rms_{when}_correction_deg"] = math.degrees(_rms(error[:, 2:])) if used else None
+            consistency[when] = float(nees(error, covariance).mean()) / 3 if used else None
+        return {
+            **facts,
+            **{f"nees_per_dimension_{when}_correction": consistency[when] for when in ("before", "after")},
             **_drift("dead_reckoned", self.dead_reckoned, self.true),
             **_drift("corrected", self.corrected, self.true),
             "plan": self.plan.model_dump(mode="json", by_alias=True),
@@ -197,13 +196,22 @@ class RobotEquipment:
         UsageError
             The catalogue has no such class, or no such camera is shipped.
         """
-        sensor = plan.build_sensor()
-        specs = specs_of(plan)
-        bank = _bank(plan, list(specs), workers)
+        sensor, specs = plan.build_sensor(), specs_of(plan)
+        low, high = plan.stop.distance_m
+        low = max(low - _BANK_MARGIN_M, 0.5)
+        steps = math.ceil((high + _BANK_MARGIN_M - low) / _BANK_STEP_M)
+        bank = BankPlan(
+            classes=tuple(specs),
+            sensor=plan.camera.sensor,
+            distance_m=tuple(low + k * _BANK_STEP_M for k in range(steps + 1)),
+            delta_deg=tuple(k * _BANK_STEP_DEG for k in range(round(180 / _BANK_STEP_DEG))),
+        )
         tilts = plan.camera.tilt_std_rad
         known: dict[str, Any] = {f"{name.removesuffix('_rad')}_std_rad": std for name, std in tilts.items()}
-        matcher = Matcher(bank, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
-        return cls(sensor, matcher, {name: _renderer(spec, sensor) for name, spec in specs.items()})
+        built = build_bank(bank, None, workers=workers)
+        matcher = Matcher(built, "refine", free=(*FREE, *tilts), background="auto", workers=workers, **known)
+        renderers = {name: Renderer(build_mesh(spec), sensor, albedo=spec.albedo) for name, spec in specs.items()}
+        return cls(sensor, matcher, renderers)
 
 
 def specs_of(plan: DrivePlan) -> dict[str, LandmarkSpec]:
@@ -220,20 +228,6 @@ def specs_of(plan: DrivePlan) -> dict[str, LandmarkSpec]:
         if name not in known:
             raise UsageError(f"'map.landmark.class' must be one of {', '.join(known)}, got {name!r}")
     return {name: known[name] for name in names}
-
-
-def _renderer(spec: LandmarkSpec, sensor: Sensor) -> Renderer:
-    return Renderer(build_mesh(spec), sensor, albedo=spec.albedo)
-
-
-def _bank(plan: DrivePlan, names: Sequence[str], workers: int | None) -> Bank:
-    low, high = plan.stop.distance_m
-    low = max(low - _BANK_MARGIN_M, 0.5)
-    steps = math.ceil((high + _BANK_MARGIN_M - low) / _BANK_STEP_M)
-    distance = tuple(low + k * _BANK_STEP_M for k in range(steps + 1))
-    delta = tuple(k * _BANK_STEP_DEG for k in range(round(180 / _BANK_STEP_DEG)))
-    bank = BankPlan(classes=tuple(names), sensor=plan.camera.sensor, distance_m=distance, delta_deg=delta)
-    return build_bank(bank, None, workers=workers)
 
 
 def run_drive(
@@ -332,16 +326,10 @@ class _Driver:
         self._note()
 
     def _note(self) -> None:
-        self.log.append(
-            (
-                np.array(self.time_s),
-                np.array(self.way_m),
-                self.world.state[:3].copy(),
-                self.dead[:3].copy(),
-                self.filter.pose.copy(),
-                self.filter.pose_covariance.copy(),
-            )
-        )
+        now = (
+            self.time_s, self.way_m, self.world.state[:3], self.dead[:3], self.filter.pose, self.filter.pose_covariance
+        )  # fmt: skip
+        self.log.append(tuple(map(np.array, now)))
 
     def _look(self) -> None:
         """Stop for the first landmark that promises enough."""
@@ -361,11 +349,12 @@ class _Driver:
         if not low <= distance <= high or abs(pan) > math.radians(plan.camera.pan_limit_deg):
             return math.inf
         half_field = math.radians(sensor.half_angle_h_deg)
+        wall_m = plan.map.wall_distance_m(lens[:2], lens[2])
         for other in plan.map.landmark:
-            if other is not landmark and abs(view_of(lens, other.xy_m, 0.0)[2]) < 2 * half_field:
-                wall = plan.map.wall_distance_m(lens[:2], lens[2])
-                if wall is None or view_of(lens, other.xy_m, 0.0)[0] < wall:
-                    return math.inf
+            far_m, _, bearing_rad = view_of(lens, other.xy_m, 0.0)
+            in_field = other is not landmark and abs(bearing_rad) < 2 * half_field
+            if in_field and (wall_m is None or far_m < wall_m):
+                return math.inf
         bound = cramer_rao(
             self.equipment.renderers[landmark.class_name],
             Views.broadcast(distance, delta),
@@ -398,14 +387,10 @@ class _Driver:
         placements = []
         if match.accepted:
             placements = plan.map.poses(
-                match,
-                pan,
-                prior=before.tolist(),
-                prior_covariance=covariance_before,
-                pan_offset_xy_m=camera.pan_offset_m,
-                lens_offset_xy_m=camera.lens_offset_m,
+                match, pan, prior=before.tolist(), prior_covariance=covariance_before,
+                pan_offset_xy_m=camera.pan_offset_m, lens_offset_xy_m=camera.lens_offset_m,
                 pan_std_rad=math.radians(camera.pan_std_deg),
-            )
+            )  # fmt: skip
         used, squared = self.filter.correct(placements)
         nearest = placements[0].pose if placements else None
         self.stops.append(

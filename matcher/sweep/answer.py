@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from phasemark.landmarks import mesh_symmetry
 from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
 from phasemark.matcher.sweep.job import SweepJob
+from phasemark.matcher.sweep.plan import Condition
 from phasemark.matcher.sweep.result_tables import Cell, condition_axes, outlier_share, outliers_in_words
 from phasemark.render import Renderer
 from phasemark.render.view import delta_period_rad
@@ -19,9 +20,12 @@ SAID = {
     "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
     "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
     "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
-    "wiggling": "wiggling of {:g}", "unit": "unit {:g}", "dimension_error": "dimensions off by {:g}",
+    "roll_deg": "a roll of {:g}°", "wiggling": "wiggling of {:g}", "unit": "unit {:g}",
+    "dimension_error": "dimensions off by {:g}",
 }  # fmt: skip
 """A condition in words, by the name of its axis."""
+ACCURATE = ("distance_m", "delta_rad")
+"""Parameters whose errors are told."""
 _POOLED = ("class_name", "distance_m", "delta_deg")
 _SAID_FIRST = (*_POOLED, "wall_m")
 
@@ -70,18 +74,22 @@ def answer(cells: Sequence[Cell]) -> str:
     if not own:
         return "No method found distance and angle in the middle of the design."
     condition = own[0].condition
-    axes = [name for name in condition_axes([one.condition for one in cells]) if name not in _SAID_FIRST]
-    where = ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
+    where = said(condition, [name for name in condition_axes([c.condition for c in cells]) if name not in _SAID_FIRST])
     wall = f", before a wall at {condition.wall_m:g} m," if condition.wall_m else ""
     trials = sum(one.n for one in own)
     right = sum(round(one.class_right.value * one.n) for one in own)
     left_out = f", {outliers_in_words(own)} left out," if outlier_share(own) else ""
-    rms = {name: _rms([one.rmse[name].value for one in own if _found(one)]) for name in ("distance_m", "delta_rad")}
+    distance_m, delta_rad = (_rms([one.rmse[name].value for one in own if _found(one)]) for name in ACCURATE)
     return (
-        f"At {condition.distance_m:g} m{f' ({where})' if where else ''}{wall} you get {1e3 * rms['distance_m']:.2g} mm"
-        f" and {math.degrees(rms['delta_rad']):.2g}° (1 σ){left_out} with {own[0].method}; class"
+        f"At {condition.distance_m:g} m{f' ({where})' if where else ''}{wall} you get {1e3 * distance_m:.2g} mm"
+        f" and {math.degrees(delta_rad):.2g}° (1 σ){left_out} with {own[0].method}; class"
         f" right {100 * right / trials:.4g} % of {trials} trials."
     )
+
+
+def said(condition: Condition, axes: Iterable[str]) -> str:
+    """Return some fields of a condition in words."""
+    return ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
 
 
 def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
@@ -116,12 +124,12 @@ def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
 
 def _found(cell: Cell) -> bool:
     """Return whether a method has an error of distance and of angle."""
-    return all(name in cell.rmse and math.isfinite(cell.rmse[name].value) for name in ("distance_m", "delta_rad"))
+    return all(name in cell.rmse and math.isfinite(cell.rmse[name].value) for name in ACCURATE)
 
 
 def _badness(cells: Sequence[Cell]) -> float:
     """Return the larger of the ratios of distance and angle to the bound, pooled; infinite where there is no bound."""
-    ratios = [_rms([one.ratio[name].value for one in cells if _found(one)]) for name in ("distance_m", "delta_rad")]
+    ratios = [_rms([one.ratio[name].value for one in cells if _found(one)]) for name in ACCURATE]
     return max(ratios) if all(map(math.isfinite, ratios)) else math.inf
 
 

@@ -7,14 +7,11 @@ noise of a trial depend on the seed, its condition and its number alone, so all 
 
 from __future__ import annotations
 
-import importlib
-import numbers
-import signal
+import math
 import threading
 import time
-import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -36,9 +33,10 @@ from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
-from phasemark.matcher.match import Match, Matches
+from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.pixel_agreement import counts
+from phasemark.matcher.sweep.own_matcher import MatchFrames, imported_matcher, own_matches
 from phasemark.matcher.sweep.plan import Method, SweepPlan
 from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
 from phasemark.render.direct.capture import capture_ranges
@@ -50,11 +48,18 @@ NONE = -1
 """Stands for "no landmark" where a class's number would be."""
 
 
-def _own_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-    """Return the fields that are stored of each method's match of a trial; views have p numbers."""
+_Field = tuple[str, tuple[int, ...], str, str]
+"""Name, shape, type and meaning of a field."""
+
+
+def _fields(p: int) -> tuple[tuple[_Field, ...], tuple[_Field, ...]]:
+    """Return the fields that are stored of each trial, and of each method's match of it; views have p numbers."""
     names = ", ".join(VIEW[:p])
     order = ", ".join(name.split("_")[0] for name in VIEW[:p])
     return (
+        ("truth", (p,), "<f8", names),
+        ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
+    ), (
         ("bound", (p, p), "<f8", f"Cramér–Rao bound at the truth, in the order {order}"),
         ("estimate", (p,), "<f8", f"{names}; NaN where there is none"),
         ("covariance", (p, p), "<f8", "the method's own covariance; NaN where it has none"),
@@ -69,20 +74,14 @@ def _own_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
     )
 
 
-def _shared_fields(p: int) -> tuple[tuple[str, tuple[int, ...], str, str], ...]:
-    """Return the fields that are stored of each trial; views have p numbers."""
-    return (
-        ("truth", (p,), "<f8", ", ".join(VIEW[:p])),
-        ("confusion", (), "<f8", "bound on the probability of a wrong class; NaN where it was not computed"),
-    )
-
-
+STORED = ("condition", "trial", *(name for fields in _fields(0) for name, *_ in fields))
+"""Names of all arrays that a file of trials holds."""
+_REFERENCE = Method(name="reference")
+"""Maximum likelihood on ranges before a known background."""
 _CONFUSION_TRIALS = 4
 """Views of a condition, which hardly differ, for which the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
 _RENDERERS_KEPT = 16
-_TERMINATED = 128 + signal.SIGTERM
-"""The exit status with which the command line ends on SIGTERM: no error of a user's module."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +103,11 @@ class Round:
     first: int
     trials: int
 
+    @classmethod
+    def first_of(cls, plan: SweepPlan) -> Round:
+        """Return the first round of a sweep: all conditions."""
+        return cls(0, tuple(range(len(plan.conditions()))), 0, plan.trials)
+
 
 class SweepJob:
     """One round of a sweep (:class:`phasemark.data.shards.build.Job`).
@@ -123,8 +127,7 @@ class SweepJob:
         self.class_names = tuple(part.name for part in known)
         self.objects = {part.name: part for part in (*known, *read_landmarks(plan.strangers, ()))}
         self._banks: dict[str, Bank] = {}
-        self._matchers: dict[tuple[str, float], Callable[[FilteredFrames], Sequence[Match]]] = {}
-        self._references: dict[float, Matcher] = {}
+        self._matchers: dict[tuple[Method, float], MatchFrames] = {}
         self._renderers: dict[tuple[Any, ...], Renderer] = {}
         self._guard = threading.Lock()
 
@@ -135,10 +138,8 @@ class SweepJob:
 
     def spec(self) -> dict[str, Any]:
         """Return a description from which another process makes the same job."""
-        return {
-            "plan": self.plan.model_dump(mode="json"),
-            "round": [self.of.number, list(self.of.conditions), self.of.first, self.of.trials],
-        }
+        number, conditions, first, trials = astuple(self.of)
+        return {"plan": self.plan.model_dump(mode="json"), "round": [number, list(conditions), first, trials]}
 
     @property
     def items(self) -> list[int]:
@@ -152,16 +153,12 @@ class SweepJob:
 
     def identity(self) -> dict[str, Any]:
         """Return all that the trials depend on."""
-        return {
-            "plan": self.plan.model_dump(mode="json"),
-            "round": self.spec()["round"],
-            "versions": versions(),
-            "mesh_sha256": {name: mesh_sha256(part.mesh) for name, part in self.objects.items()},
-        }
+        meshes = {name: mesh_sha256(part.mesh) for name, part in self.objects.items()}
+        return {**self.spec(), "versions": versions(), "mesh_sha256": meshes}
 
     def lay_out(self) -> tuple[Layout, list[list[Place]]]:
         """Return all but the trials, and where these go."""
-        n, methods = sum(self.items), len(self.plan.methods)
+        n = sum(self.items)
         with Layout() as layout:
             file = layout.file
             file.attrs["format"] = FORMAT
@@ -173,14 +170,11 @@ class SweepJob:
             numbers = np.concatenate([self.of.first + np.arange(count) for count in self.items])
             file.create_dataset("trial", data=numbers.astype("<i8"))
             first = []
-            for name, shape, kind, long_name in _shared_fields(self.plan.n_numbers):
-                dataset, offset = layout.reserve(file, name, (n, *shape), kind)
-                dataset.attrs["long_name"] = long_name
-                first.append(Place(offset, int(np.prod(shape)) * np.dtype(kind).itemsize))
-            for name, shape, kind, long_name in _own_fields(self.plan.n_numbers):
-                dataset, offset = layout.reserve(file, name, (n, methods, *shape), kind)
-                dataset.attrs["long_name"] = long_name
-                first.append(Place(offset, methods * int(np.prod(shape)) * np.dtype(kind).itemsize))
+            for fields, each in zip(_fields(self.plan.n_numbers), ((), (len(self.plan.methods),)), strict=True):
+                for name, shape, kind, long_name in fields:
+                    dataset, offset = layout.reserve(file, name, (n, *each, *shape), kind)
+                    dataset.attrs["long_name"] = long_name
+                    first.append(Place(offset, math.prod((*each, *shape)) * np.dtype(kind).itemsize))
         return layout, [
             [Place(place.offset + int(before) * place.stride, place.stride) for place in first]
             for before in np.cumsum([0, *self.items[:-1]])
@@ -212,9 +206,9 @@ class SweepJob:
         number = self.of.conditions[slab]
         first = self.of.first + start
         views = self.views(number, first, self.of.first + stop)
-        truth = np.stack([getattr(views, name) for name in VIEW[: self.plan.n_numbers]], axis=1)
         p = self.plan.n_numbers
-        own = _own_fields(p)
+        truth = np.stack([getattr(views, name) for name in VIEW[:p]], axis=1)
+        _, own = _fields(p)
         out = {name: np.zeros((len(views), len(self.plan.methods), *shape), kind) for name, shape, kind, _ in own}
         image = self.image(number, views)
         frames: dict[tuple[str, str], FilteredFrames] = {}
@@ -366,7 +360,7 @@ class SweepJob:
         exact = noise_free(image, condition.n_frames, counts(image.phasor, image.intensity, sensor))
         squares = np.full((n, len(self.class_names)), DEFAULT_POLICY.likely_cost)
         squares[:, self.class_names.index(condition.class_name)] = np.inf
-        for k, match in enumerate(self._reference(condition.wall_m).match(exact)):
+        for k, match in enumerate(self.matcher(_REFERENCE, condition.wall_m)(exact)):
             for other in match.alternatives:
                 c = self.class_names.index(other.class_name)
                 if other.class_name != condition.class_name:
@@ -376,30 +370,18 @@ class SweepJob:
         found[:n] = confusion_probability(squares)
         return found
 
-    def _reference(self, wall_m: float) -> Matcher:
-        """Return maximum likelihood on ranges before a known background."""
+    def matcher(self, method: Method, wall_m: float) -> MatchFrames:
+        """Return a method, ready to match frames before a wall that it may know; it is kept."""
+        if method.knows != "wall":
+            wall_m = 0.0
         with self._guard:
-            if wall_m not in self._references:
-                background = Background(wall_m=wall_m) if wall_m else None
-                bank = self._bank(Method(name="reference"))
-                on = self.explained(Method(name="reference"))
-                self._references[wall_m] = Matcher(
-                    bank, "refine", free=VIEW[:2], background=None if on == "reported" else background, on=on, workers=1
-                )
-            return self._references[wall_m]
+            if (method, wall_m) not in self._matchers:
+                self._matchers[method, wall_m] = self._matcher(method, wall_m)
+            return self._matchers[method, wall_m]
 
-    def matcher(self, number: int, m: int) -> Callable[[FilteredFrames], Sequence[Match]]:
-        """Return a method, ready to match the frames of a condition."""
-        method = self.plan.methods[m]
-        wall_m = self.all_conditions[number].wall_m if method.knows == "wall" else 0.0
-        with self._guard:
-            if (method.name, wall_m) not in self._matchers:
-                self._matchers[method.name, wall_m] = self._matcher(method, wall_m)
-            return self._matchers[method.name, wall_m]
-
-    def _matcher(self, method: Method, wall_m: float) -> Callable[[FilteredFrames], Sequence[Match]]:
+    def _matcher(self, method: Method, wall_m: float) -> MatchFrames:
         if method.is_program:
-            return _imported(method.method)
+            return imported_matcher(method.method)
         bank = self._bank(method)
         background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
         if method.knows == "auto":
@@ -427,12 +409,12 @@ class SweepJob:
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
+        match = self.matcher(method, self.all_conditions[number].wall_m)
         if method.is_program:
-            match = self.matcher(number, m)
-            matches = _matches_of_plugin(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
+            matches = own_matches(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
         else:
             try:
-                matches = Matches(self.matcher(number, m)(frames))
+                matches = Matches(match(frames))
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):
@@ -469,96 +451,6 @@ def job_of(spec: dict[str, Any]) -> SweepJob:
     """Return the job that :meth:`SweepJob.spec` describes."""
     number, conditions, first, trials = spec["round"]
     return SweepJob(SweepPlan(**spec["plan"]), Round(number, tuple(conditions), first, trials))
-
-
-def check_matcher(text: str) -> None:
-    """Refuse a ``module:callable`` that cannot be imported.
-
-    Raises
-    ------
-    UsageError
-        With the reason; if the module's own code failed, its traceback is a note of the error (:pep:`678`).
-    """
-    _imported(text)
-
-
-def _imported(text: str) -> Callable[[FilteredFrames], Sequence[Match]]:
-    module, _, name = text.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, SystemExit) and error.code == _TERMINATED:
-            raise
-        failed = UsageError(f"the matcher '{text}' cannot be imported ({_named(error)})")
-        if own := _own_traceback(error):
-            failed.add_note(own)
-        raise failed from None
-    if not callable(found):
-        raise UsageError(f"the matcher '{text}' must be callable, got {type(found).__name__}")
-    match: Callable[[FilteredFrames], Sequence[Match]] = found
-    return match
-
-
-def _matches_of_plugin(
-    match: Callable[[FilteredFrames], Any], text: str, frames: FilteredFrames, where: str, names: Sequence[str]
-) -> Matches:
-    """Call a user's matcher, and refuse what is not a Match for each frame."""
-    due = f"{where}: the matcher '{text}' must return a Match for each of the {len(frames)} frames"
-    try:
-        found = match(frames)
-        matches = list(found) if isinstance(found, Iterable) else None
-    except (Exception, SystemExit) as error:
-        failed = UsageError(f"{where}: the matcher '{text}' raised {_named(error)}")
-        failed.add_note(_own_traceback(error) or _named(error))
-        raise failed from None
-    if matches is None:
-        raise UsageError(f"{due}, got {'None' if found is None else f'an object of type {type(found).__name__}'}")
-    for k, one in enumerate(matches):
-        if not isinstance(one, Match):
-            raise UsageError(f"{due}, got an object of type {type(one).__name__} for frame {k}")
-        if (wrong := _wrong_field(one, names)) is not None:
-            raise UsageError(f"{due}, but the Match for frame {k} has {wrong}")
-    if len(matches) != len(frames):
-        raise UsageError(f"{due}, got {len(matches)}")
-    return Matches(matches)
-
-
-def _wrong_field(match: Match, names: Sequence[str]) -> str | None:
-    """Return the fault in the types of a user's match, or None."""
-    if not isinstance(match.class_name, str | None):
-        return f"'class_name' {match.class_name!r}: it must be a str or None"
-    for name in (*names, "chi2", "p_value"):
-        value = getattr(match, name)
-        if not isinstance(value, numbers.Real):
-            return f"'{name}' of type {type(value).__name__}: it must be a number"
-    if not isinstance(match.dof, numbers.Integral):
-        return f"'dof' of type {type(match.dof).__name__}: it must be a whole number"
-    if not isinstance(match.class_probability, Mapping):
-        return f"'class_probability' of type {type(match.class_probability).__name__}: it must be a mapping"
-    if match.covariance is not None:
-        n = len(match.free)
-        if not set(match.free) <= set(names):
-            return f"'free' {match.free!r}: it must name some of {', '.join(names)}"
-        if np.shape(match.covariance) != (n, n):
-            return f"'covariance' of shape {np.shape(match.covariance)}: it must be {(n, n)}, as 'free' has {n} names"
-    return None
-
-
-def _named(error: BaseException) -> str:
-    """Return type and message of an exception in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
-
-
-def _own_traceback(error: BaseException) -> str:
-    """Return the traceback of a user's code, without our calls and those that import it; empty if nothing is left."""
-    own = error.__traceback__
-    while own is not None and _is_ours_or_import(own.tb_frame.f_code.co_filename):
-        own = own.tb_next
-    return "" if own is None else "".join(traceback.format_exception(type(error), error, own)).rstrip()
-
-
-def _is_ours_or_import(filename: str) -> bool:
-    return filename in (__file__, importlib.__file__) or filename.startswith("<frozen importlib")
 
 
 def _spread(matrix: NDArray[np.float64], free: Sequence[str], n: int, p: int) -> NDArray[np.float64]:

@@ -15,16 +15,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from phasemark.data.files.atomic_write import storage_errors, write_atomically
-from phasemark.data.files.folder_marker import OwnedFiles
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_figure
 from phasemark.matcher.statistics import Interval
-from phasemark.matcher.sweep.answer import SAID, answer, answer_cells, card_of
-from phasemark.matcher.sweep.examples import example_trials, job_of_plan
-from phasemark.matcher.sweep.figures.sheet import sweep_figures
-from phasemark.matcher.sweep.figures.style import COLUMN_NAME
-from phasemark.matcher.sweep.job import SweepJob
+from phasemark.matcher.sweep.answer import answer, answer_cells, card_of, said
+from phasemark.matcher.sweep.examples import example_trials
+from phasemark.matcher.sweep.figures.sheet import SweepFigure, sweep_figures
+from phasemark.matcher.sweep.figures.style import AXIS_LABEL
+from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan
 from phasemark.matcher.sweep.result_tables import (
     Cell,
@@ -71,39 +70,26 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     folder = Path(folder)
     read_plan_of(folder)
     with sweep_folder(folder) as ours:
-        return _write_report(ours)
+        plan, trials = read_sweep(folder)
+        ours.claim("cells.csv", "sweep.json", "report.html")
+        cells = write_cells(plan, trials, folder)
+        with storage_errors(folder):
+            (folder / "figures").mkdir(exist_ok=True)
+        figures = list(sweep_figures(plan, trials, cells))
+        ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
+        shown = [_written(figure, folder / "figures") for figure in figures]
+        page = _page(plan, trials, cells, folder, shown)
+        return write_atomically(folder / "report.html", page.encode(), force=True)
 
 
-def _write_report(ours: OwnedFiles) -> Path:
-    folder = ours.folder
-    plan, trials = read_sweep(folder)
-    ours.claim("cells.csv", "sweep.json", "report.html")
-    cells = write_cells(plan, trials, folder)
+def _page(
+    plan: SweepPlan, trials: SweepTrials, cells: Sequence[Cell], folder: Path, shown: Sequence[dict[str, Any]]
+) -> str:
     landmarks = [cell for cell in cells if not cell.stranger]
-    with storage_errors(folder):
-        (folder / "figures").mkdir(exist_ok=True)
-    shown = []
-    figures = list(sweep_figures(plan, trials, cells))
-    ours.claim(*(f"figures/{figure.name}.{kind}" for figure in figures for kind in ("png", "svg")))
-    for figure in figures:
-        png, svg = figure_png(figure.figure), io.BytesIO()
-        with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
-            figure.figure.savefig(svg, format="svg", metadata={"Date": None})
-        for kind, content in (("png", png), ("svg", svg.getvalue())):
-            write_atomically(folder / "figures" / f"{figure.name}.{kind}", content, force=True)
-        wide = figure.figure.get_figwidth() > _READABLE_IN
-        shown.append(
-            {
-                "title": figure.title,
-                "text": figure.text,
-                "image": embedded_png(png, figure.title),
-                "wide": wide,
-            }
-        )
-    job = job_of_plan(plan)
+    job = SweepJob(plan, Round.first_of(plan))
     card = card_of(job, landmarks)
     axes = condition_axes([cell.condition for cell in cells])
-    page = page_template("phasemark.matcher.sweep", "page.html.j2").render(
+    return page_template("phasemark.matcher.sweep", "page.html.j2").render(
         plan=plan,
         answer=answer(landmarks),
         card=None if card is None else f"{_first_class(landmarks)} {card.line()}",
@@ -112,9 +98,9 @@ def _write_report(ours: OwnedFiles) -> Path:
         gallery=_gallery(job),
         range_colours=RANGE_COLOURS,
         figures=shown,
-        examples=_examples(job, trials, folder),
+        examples=example_trials(job, trials, max(1, _MOST_EXAMPLES // len(trials.methods)), folder),
         header=(
-            *(COLUMN_NAME[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
+            *(AXIS_LABEL[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
             "share of classes right", "NEES per parameter", "coverage of the 95 % ellipsoid",
         ),
@@ -123,7 +109,17 @@ def _write_report(ours: OwnedFiles) -> Path:
         facts=_facts(plan, trials),
         commands=_commands(plan, folder),
     )  # fmt: skip
-    return write_atomically(folder / "report.html", page.encode(), force=True)
+
+
+def _written(shown: SweepFigure, folder: Path) -> dict[str, Any]:
+    """Write a figure as PNG and SVG, and return what the page shows of it."""
+    png, svg = figure_png(shown.figure), io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
+        shown.figure.savefig(svg, format="svg", metadata={"Date": None})
+    for kind, content in (("png", png), ("svg", svg.getvalue())):
+        write_atomically(folder / f"{shown.name}.{kind}", content, force=True)
+    wide = shown.figure.get_figwidth() > _READABLE_IN
+    return {"title": shown.title, "text": shown.text, "image": embedded_png(png, shown.title), "wide": wide}
 
 
 def summary(trials: SweepTrials, cells: Sequence[Cell]) -> list[str]:
@@ -197,15 +193,10 @@ def _classes(trials: SweepTrials, m: int) -> str:
 
 
 def _where(cell: Cell, cells: Sequence[Cell]) -> str:
-    axes = condition_axes([one.condition for one in cells])
-    first = cells[0].condition
+    axes, first = condition_axes([one.condition for one in cells]), cells[0].condition
     # of what may be wrong with the model, only what is wrong here
-    values = [
-        (name, getattr(cell.condition, name))
-        for name in axes
-        if name in _ALWAYS_SAID or getattr(cell.condition, name) != getattr(first, name)
-    ]
-    return ", ".join(SAID[name].format(value) if name in SAID else f"{name} = {value:g}" for name, value in values)
+    shown = [n for n in axes if n in _ALWAYS_SAID or getattr(cell.condition, n) != getattr(first, n)]
+    return said(cell.condition, shown)
 
 
 def _badness(cell: Cell) -> float:
@@ -221,10 +212,8 @@ def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
     return sorted(cells, key=_rank, reverse=True)
 
 
-def _with_interval(value: Interval, scale: float = 1.0) -> str:
-    if not math.isfinite(value.value):
-        return "–"
-    return with_interval(value.value * scale, value.low * scale, value.high * scale)
+def _with_interval(one: Interval) -> str:
+    return with_interval(one.value, one.low, one.high) if math.isfinite(one.value) else "–"
 
 
 def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
@@ -232,7 +221,7 @@ def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
     out = [f"{value:g}" if isinstance(value, int | float) else str(value) for value in values]
     out += [cell.method, str(cell.n), _with_interval(cell.outliers)]
     for name, _, _, scale in _PARAMETERS:
-        out += [_with_interval(cell.rmse[name], scale), f"{cell.bound[name] * scale:.3g}"]
+        out += [_with_interval(cell.rmse[name].scaled(scale)), f"{cell.bound[name] * scale:.3g}"]
         out.append(_with_interval(cell.ratio[name]))
     out += [_with_interval(one) for one in (cell.class_right, cell.nees, cell.coverage[0.95])]
     return out
@@ -246,10 +235,8 @@ def _commands(plan: SweepPlan, folder: Path) -> list[str]:
     """Return two commands: run the sweep again into a new folder, and write this page from existing trials."""
     where = shlex.quote(str(folder))
     given, again = shlex.quote(str(folder / "plan.json")), shlex.quote(f"{folder}-again")
-    run = f"phasemark sweep run {given} --out {again}"
-    if any(method.is_program for method in plan.methods):
-        run = f"phasemark sweep run {given} --out {again} --trust-plan"
-    return [run, f"phasemark sweep report {where}"]
+    trust = " --trust-plan" if any(method.is_program for method in plan.methods) else ""
+    return [f"phasemark sweep run {given} --out {again}{trust}", f"phasemark sweep report {where}"]
 
 
 def _gallery(job: SweepJob) -> Iterator[dict[str, Any]]:
@@ -268,17 +255,6 @@ def _gallery(job: SweepJob) -> Iterator[dict[str, Any]]:
             "view": f"D = {views.distance_m[0]:.3f} m, δ = {math.degrees(views.delta_rad[0]):.1f}°",
             "mesh": embedded_png(mesh_figure(shown.mesh), f"The {name}"),
             "frame": embedded_png(figure_png(figure), f"Filtered range image of the {name}"),
-        }
-
-
-def _examples(job: SweepJob, trials: SweepTrials, folder: Path) -> Iterator[dict[str, Any]]:
-    of_each = max(1, _MOST_EXAMPLES // len(trials.methods))
-    for one in example_trials(job, trials, of_each):
-        yield {
-            "title": f"{one.method}, {one.rank}: condition {one.condition}, trial {one.trial}",
-            "text": one.text,
-            "image": embedded_png(figure_png(one.figure), one.text),
-            "command": f"phasemark sweep frames {shlex.quote(str(folder))} {one.condition} {one.trial} -o frames.npz",
         }
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +23,8 @@ from phasemark.data.progress import Progress
 from phasemark.data.shards.build import difference
 from phasemark.data.shards.remote import check_scheduler
 from phasemark.data.shards.run import outputs_of, produce
-from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, Round, SweepJob, check_matcher
+from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, STORED, Round, SweepJob
+from phasemark.matcher.sweep.own_matcher import imported_matcher
 from phasemark.matcher.sweep.plan import SweepPlan, stored_plan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
 
@@ -33,10 +32,6 @@ TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
 _PLAN = "plan.json"
 _TABLES = ("trials.csv", "cells.csv", "sweep.json", "report.html")
-_OF_A_SWEEP = re.compile(
-    r"(plan\.json|trials\.csv|cells\.csv|sweep\.json|report\.html|figures/[\w-]+\.(png|svg|csv)"
-    r"|trials-\d{3}\.h5(\.sha256|\.partial|\.manifest)?)"
-)
 
 
 def run_sweep(
@@ -85,40 +80,26 @@ def run_sweep(
     plan = plan.resolve()
     for method in plan.methods:
         if method.is_program:
-            check_matcher(method.method)
+            imported_matcher(method.method)
     check_scheduler(scheduler)
     folder = Path(folder)
     refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
     with sweep_folder(folder) as ours:
-        return _run(plan, ours, workers, scheduler, resume=resume, force=force, progress=progress)
-
-
-def _run(
-    plan: SweepPlan,
-    ours: OwnedFiles,
-    workers: int | None,
-    scheduler: str,
-    *,
-    resume: bool,
-    force: bool,
-    progress: Progress | None,
-) -> SweepTrials:
-    folder = ours.folder
-    _begin(plan, ours, resume=resume, force=force)
-    rounds: list[Round] = []
-    following: Round | None = Round(0, tuple(range(len(plan.conditions()))), 0, plan.trials)
-    while following is not None:
-        path = _round_path(folder, following.number)
-        ours.claim(*(output.name for output in outputs_of(path)))
-        produce(
-            SweepJob(plan, following), path, finished=_identity, resume=True, workers=workers,
-            shard_items=TRIALS_AT_ONCE, scheduler=scheduler, progress=progress,
-        )  # fmt: skip
-        rounds.append(following)
-        trials = _read(plan, folder, len(rounds))
-        following = _next_round(plan, trials, rounds)
-    write_atomically(folder / "trials.csv", trials_csv(trials), force=True)
-    write_cells(plan, trials, folder)
+        _begin(plan, ours, resume=resume, force=force)
+        rounds: list[Round] = []
+        following: Round | None = Round.first_of(plan)
+        while following is not None:
+            path = _round_path(folder, following.number)
+            ours.claim(*(output.name for output in outputs_of(path)))
+            produce(
+                SweepJob(plan, following), path, finished=_identity, resume=True, workers=workers,
+                shard_items=TRIALS_AT_ONCE, scheduler=scheduler, progress=progress,
+            )  # fmt: skip
+            rounds.append(following)
+            trials = _read(plan, folder, len(rounds))
+            following = _next_round(plan, trials, rounds)
+        write_atomically(folder / "trials.csv", trials_csv(trials), force=True)
+        write_cells(plan, trials, folder)
     return trials
 
 
@@ -193,8 +174,7 @@ def _stored_plan(folder: Path) -> SweepPlan | None:
     return stored_plan(path)
 
 
-@contextmanager
-def sweep_folder(folder: Path) -> Iterator[OwnedFiles]:
+def sweep_folder(folder: Path) -> AbstractContextManager[OwnedFiles]:
     """Lock a sweep's folder against other runs, and list the files in it that belong to the sweep.
 
     Raises
@@ -202,19 +182,7 @@ def sweep_folder(folder: Path) -> Iterator[OwnedFiles]:
     OutputExistsError
         Another run is writing it.
     """
-    with adding_to_folder(folder, "sweep run", _adopted(folder)) as ours:
-        yield ours
-
-
-def _adopted(folder: Path) -> Iterator[str]:
-    """Yield the names of a sweep's files, if the folder holds a sweep of before there were markers."""
-    try:
-        if _stored_plan(folder) is None:
-            return
-    except InputFileError:  # a file of that name which is not ours
-        return
-    names = [str(path.relative_to(folder)) for path in (*folder.iterdir(), *folder.glob("figures/*"))]
-    yield from filter(_OF_A_SWEEP.fullmatch, names)
+    return adding_to_folder(folder, "sweep run")
 
 
 def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> None:
@@ -262,25 +230,22 @@ def _next_round(plan: SweepPlan, trials: SweepTrials, rounds: list[Round]) -> Ro
 
 def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
     parts: dict[str, list[Any]] = {}
-    names = (
-        "condition", "trial", "truth", "confusion", "estimate", "bound", "covariance", "chi2", "p_value", "p_none",
-        "seconds", "dof", "found", "modes", "accepted",
-    )  # fmt: skip
     for number in range(n_rounds):
         path = _round_path(folder, number)
         with open_hdf5(path, "sweep", untrusted=True) as file, reading(path):
             check_format(file, path, "sweep", FORMAT, SCHEMA_VERSION)
-            for name in names:
+            for name in STORED:
                 parts.setdefault(name, []).append(file[name][...])
     # one round is most of the memory, and is not copied
     arrays: dict[str, NDArray[Any]] = {
-        name: np.concatenate(parts.pop(name)) if n_rounds > 1 else parts.pop(name)[0] for name in names
+        name: np.concatenate(parts.pop(name)) if n_rounds > 1 else parts.pop(name)[0] for name in STORED
     }
     if n_rounds > 1:  # alone it is in order
         order = np.lexsort((arrays["trial"], arrays["condition"]))
         arrays = {name: values[order] for name, values in arrays.items()}
-    for name in ("condition", "trial", "dof", "found", "modes"):
-        arrays[name] = arrays[name].astype(np.int64)
+    for name, values in arrays.items():
+        if values.dtype.kind in "iu":
+            arrays[name] = values.astype(np.bool_ if name == "accepted" else np.int64)
     return SweepTrials(
         conditions=plan.conditions(),
         methods=tuple(method.name for method in plan.methods),
@@ -288,5 +253,5 @@ def _read(plan: SweepPlan, folder: Path, n_rounds: int) -> SweepTrials:
         classes=plan.class_names,
         symmetry=tuple(part.symmetry or 1 for part in plan.parts()),
         outlier=plan.outlier,
-        **{**arrays, "accepted": arrays["accepted"].astype(np.bool_)},
+        **arrays,
     )

@@ -9,13 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from phasemark.render.bench.data_sheet.results import FIGURES, Characterisation, Comparison
+from phasemark.render.charts import marked, panels, style
 from phasemark.render.figures import draw_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-
-_STYLES = (("#0072B2", "o"), ("#D55E00", "s"), ("#009E73", "^"))
-"""Colours that differ for the colour-blind, with marks that differ without colour."""
 
 _LABELS = {
     "mean_code": "mean of a tap over the black level (codes)",
@@ -85,8 +83,8 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
         lowest: Axes = below
     else:
         lowest = axes = figure.subplots()
-    for one, (colour, marker) in zip(series, _STYLES, strict=False):
-        _draw_series(axes, one, colour, marker, alone=len(series) == 1)
+    for k, one in enumerate(series):
+        _draw_series(axes, one, k, alone=len(series) == 1)
     logarithmic = name in _LOGARITHMIC and found.sensor.kind == "phase"
     logarithmic &= all(
         ((one.predicted > 0) & (one.simulated > 0)).any() for one in series
@@ -110,11 +108,11 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
     return figure
 
 
-def _draw_series(axes: Axes, one: Comparison, colour: str, marker: str, *, alone: bool) -> None:
-    name = "" if alone else f", {one.label}"
+def _draw_series(axes: Axes, one: Comparison, k: int, *, alone: bool) -> None:
+    (colour, marker, _), name = style(k), "" if alone else f", {one.label}"
     axes.plot(one.curve_x, one.curve_y, color=colour, linewidth=1.2, label=f"predicted{name}")
     if one.law_y is not None:
-        label = "noise law without patterns" if colour == _STYLES[0][0] else None
+        label = None if k else "noise law without patterns"
         axes.plot(one.curve_x, one.law_y, color="0.45", linewidth=1.0, linestyle=":", label=label)
     axes.errorbar(
         one.x, one.simulated, yerr=one.half95, color=colour, marker=marker, linestyle="none", markersize=4.5,
@@ -127,10 +125,10 @@ def _draw_series(axes: Axes, one: Comparison, colour: str, marker: str, *, alone
 
 
 def _draw_deviations(axes: Axes, series: tuple[Comparison, ...]) -> None:
-    for one, (colour, marker) in zip(series, _STYLES, strict=False):
+    for k, one in enumerate(series):
         used = one.compared
         pull = (one.simulated - one.predicted)[used] / one.std_error[used]
-        axes.plot(one.x[used], pull, color=colour, marker=marker, linestyle="none", markersize=4)
+        axes.plot(one.x[used], pull, **marked(k, linestyle="none"))
     axes.axhspan(-1.96, 1.96, color="0.9")
     axes.axhline(0, color="0.5", linewidth=0.8)
     reach = max(4.0, *(float(np.abs(line.get_ydata()).max(initial=0.0)) * 1.1 for line in axes.lines))
@@ -140,24 +138,21 @@ def _draw_deviations(axes: Axes, series: tuple[Comparison, ...]) -> None:
 
 
 def _mark_limits(axes: Axes, name: str, found: Characterisation) -> None:
-    sensor = found.sensor
+    sensor, half = found.sensor, found.quantity("saturation_flags_half_e")
+    limit: tuple[float, str] | None = None
     if name == "photon_transfer" and np.isfinite(sensor.saturation_e):
-        per_e = sensor.gain if sensor.adc_bits is not None else 1.0
-        axes.axvline(sensor.saturation_e * per_e, color="0.3", linestyle="--", linewidth=1, label="a tap saturates")
+        limit = sensor.saturation_e * (sensor.gain if sensor.adc_bits is not None else 1.0), "a tap saturates"
     if name == "linearity" and sensor.kind == "phase":
-        axes.axvline(sensor.unambiguous_range_m, color="0.3", linestyle="--", linewidth=1, label="wrap, c / 2f")
-    if name == "saturation":
-        half = found.quantity("saturation_flags_half_e")
-        if half is not None:
-            axes.axvline(
-                half.predicted, color="0.3", linestyle="--", linewidth=1, label="half of the frames, predicted"
-            )
+        limit = sensor.unambiguous_range_m, "wrap, c / 2f"
+    if name == "saturation" and half is not None:
+        limit = half.predicted, "half of the frames, predicted"
+    if limit is not None:
+        axes.axvline(limit[0], color="0.3", linestyle="--", linewidth=1, label=limit[1])
 
 
 def _pattern_figure(found: Characterisation) -> Figure:
-    figure = Figure(figsize=(4.2 * len(found.maps), 4.3), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(found.maps)))
-    for axes, (name, values) in zip(panels, found.maps.items(), strict=True):
+    figure, (row,) = panels(len(found.maps), width=4.2, height=4.3)
+    for axes, (name, values) in zip(row, found.maps.items(), strict=True):
         title, unit, scale = _MAPS[name]
         shown = values * scale
         centre = float(np.nanmean(shown))

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from phasemark import UsageError
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.targets import Status
-from phasemark.render.figures import draw_range, view_in_words
+from phasemark.render.figures import check_index, draw_range, view_in_words, whole_ticks
 from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -44,8 +42,8 @@ def histogram_figure(frames: HistogramFrames, index: int = 0, frame: int = 0) ->
     -------
     matplotlib.figure.Figure
     """
-    _check("position", index, len(frames))
-    _check("frame", frame, frames.n_frames)
+    check_index("position", index, len(frames))
+    check_index("frame", frame, frames.n_frames)
     return _figure(frames.counts[index, frame], frames.sensor, "counts", f"position {index}, frame {frame}")
 
 
@@ -62,20 +60,16 @@ def expected_figure(images: HistogramImages, index: int = 0) -> Figure:
     -------
     matplotlib.figure.Figure
     """
-    _check("view", index, len(images))
+    check_index("view", index, len(images))
     title = f"view {index}: {view_in_words(images.views, index)}"
     return _figure(images.expected[index], images.sensor, "expected counts", title)
 
 
-def _check(what: str, index: int, count: int) -> None:
-    if not 0 <= index < count:
-        raise UsageError(f"there is no {what} {index}: they count from 0 to {count - 1}")
-
-
 def _figure(counts: NDArray[np.float64], sensor: Sensor, what: str, title: str) -> Figure:
+    """Draw (rows, cols, bins) counts beside the ranges that the chip makes of them."""
+    one = HistogramFrames(counts, sensor=sensor)
     figure = Figure(figsize=(12.4, 6.2), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
-    one = HistogramFrames(counts, sensor=sensor)
     _draw_histograms(left, counts, one, what)
     right.set_title("range of the nearest target")
     draw_range(right, one.ranges.range_m[0, 0])
@@ -105,8 +99,7 @@ def _draw_histograms(axes: Axes, counts: NDArray[np.float64], one: HistogramFram
     axes.vlines(range(cols + 1), 0, rows, color="0.8", linewidth=0.6)
     axes.hlines(range(rows + 1), 0, cols, color="0.8", linewidth=0.6)
     axes.set(xlim=(0, cols), ylim=(rows, 0), aspect="equal")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_locator(MaxNLocator(nbins=8, integer=True, steps=[1, 2, 4, 5, 10]))
+    whole_ticks(axes)
     last_m = histogram.start_m + bins * histogram.bin_width_m
     axes.set_title(f"{what} in each zone")
     axes.set_xlabel(f"zone columns; in each the range, {histogram.start_m:.3g} to {last_m:.3g} m")
@@ -123,9 +116,9 @@ def _places(one: HistogramFrames) -> NDArray[np.object_]:
     """Return where the targets of one frame lie in each zone's histogram, bins."""
     found, sensor, histogram = one.targets, one.sensor, histogram_of(one.sensor)
     cosine = sensor.axis_cosine()[..., None] if histogram.reports == "z" else 1.0
+    scale = np.array(histogram.zone_bin_scale or ((1.0,) * sensor.cols,) * sensor.rows)[..., None]
     delay = (sensor.zone_offsets + sensor.range_offset_m)[..., None]
-    width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale")[..., None]
-    bins = (found.distance_m[0, 0] / cosine + delay - histogram.start_m) / width_m
+    bins = (found.distance_m[0, 0] / cosine + delay - histogram.start_m) / (histogram.bin_width_m * scale)
     valid = found.status[0, 0] == Status.VALID
     out = np.empty((sensor.rows, sensor.cols), object)
     for row in range(sensor.rows):

@@ -11,8 +11,18 @@ from scipy import stats
 
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.statistics import binomial_interval, nees
-from phasemark.matcher.sweep.figures.style import as_written, logarithmic, methods_of, panels, style
+from phasemark.matcher.sweep.figures.style import methods_of
 from phasemark.matcher.sweep.result_tables import LEVELS, Cell, SweepTrials
+from phasemark.render.charts import (
+    as_written,
+    explain,
+    legend_above,
+    logarithmic,
+    panels,
+    panels_of,
+    style,
+    written_table,
+)
 
 _MOST_POINTS = 2000
 _LEAST_BOUND = 1e-7
@@ -42,10 +52,7 @@ def nees_quantiles(trials: SweepTrials) -> Figure:
         top = max(top, float(expected[-1]))
     panel.plot([0, top], [0, top], color="black", linewidth=0.8, label="honest")
     panel.set_ylim(0, 1.5 * top)
-    panel.set_xlabel("quantile of χ² (–)")
-    panel.set_ylabel("quantile of eᵀP⁻¹e (–)")
-    panel.grid(linewidth=0.3)
-    panel.legend(fontsize=7)
+    explain(panel, "quantile of χ² (–)", "quantile of eᵀP⁻¹e (–)", legend="best")
     return figure
 
 
@@ -64,38 +71,27 @@ def coverage(cells: Sequence[Cell]) -> Figure:
             if mine:
                 panel.plot(x, shares, mark, color=colour, markersize=2, label=as_written(method))
         panel.axhline(100 * level, color="black", linewidth=0.8)
-        panel.set_title(f"{100 * level:g} %", fontsize=9)
-        panel.set_xlabel("cell")
-        panel.grid(linewidth=0.3)
+        explain(panel, "cell", "", f"{100 * level:g} %")
     row[0].set_ylabel("share of errors within the ellipsoid (%)")
-    figure.legend(*row[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
+    legend_above(figure, row[0])
     return figure
 
 
 def confusion(trials: SweepTrials) -> Figure:
     """Draw what was found, by true class, and strangers below; a match that was not accepted counts as refused."""
-    methods = len(trials.methods)
-    figure, rows = panels(min(2, methods), -(-methods // 2), height=3.4)
+    figure, shown = panels_of(len(trials.methods), height=3.4)
     names = (*trials.classes, "refused")
-    shown = [condition.class_name for condition in trials.conditions]
-    present = list(dict.fromkeys(shown))
-    of_trial = np.array([present.index(name) for name in shown])[trials.condition]
-    every = [panel for row in rows for panel in row]
-    for m, panel in zip(range(methods), every, strict=False):
+    shown_class = np.array([condition.class_name for condition in trials.conditions])[trials.condition]
+    present = list(dict.fromkeys(condition.class_name for condition in trials.conditions))
+    for m, panel in enumerate(shown):
         found = np.where(trials.refused[:, m], len(trials.classes), trials.found[:, m])
-        table = np.array([[np.mean(found[of_trial == k] == j) for j in range(len(names))] for k in range(len(present))])
-        panel.imshow(table, cmap="cividis", vmin=0, vmax=1, aspect="auto")
-        for i, j in np.ndindex(table.shape):
-            text = f"{100 * table[i, j]:.3g} %" if table[i, j] else "0"
-            colour = "black" if table[i, j] > 0.5 else "white"
-            panel.text(j, i, text, ha="center", va="center", color=colour, fontsize=7)
-        panel.set_xticks(range(len(names)), names, fontsize=8)
-        panel.set_yticks(range(len(present)), present, fontsize=8)
-        panel.set_xlabel("found")
-        panel.set_ylabel("shown")
+        table = np.array([[np.mean(found[shown_class == name] == j) for j in range(len(names))] for name in present])
+        texts = np.array([[f"{100 * share:.3g} %" if share else "0" for share in row] for row in table], object)
+        written_table(
+            panel, table, ("found", names), ("shown", present), texts, table <= 0.5, cmap="cividis", vmin=0, vmax=1
+        )
+        panel.tick_params(labelsize=8)
         panel.set_title(as_written(trials.methods[m]), fontsize=9)
-    for panel in every[methods:]:
-        panel.set_axis_off()
     return figure
 
 
@@ -124,10 +120,9 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
     ends = np.array([_LEAST_BOUND, 1.0])
     panel.plot(ends, ends, color="black", linewidth=0.8, label="bound")
     panel.set(xscale="log", yscale="log", ylim=(0.3 * least, 1.5))
-    panel.set_xlabel(f"bound on the probability of a wrong class (–), {_LEAST_BOUND:g} where it is less")
-    panel.set_ylabel("share of wrong classes (–)")
-    panel.grid(linewidth=0.3)
-    figure.legend(*panel.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
+    x_label = f"bound on the probability of a wrong class (–), {_LEAST_BOUND:g} where it is less"
+    explain(panel, x_label, "share of wrong classes (–)")
+    legend_above(figure, panel)
     return figure
 
 
@@ -148,10 +143,7 @@ def risk(trials: SweepTrials) -> Figure:
         colour, _, stroke = style(m)
         panel.plot(100 * kept[show] / landmarks, rms[show], color=colour, linestyle=stroke, label=as_written(method))
     logarithmic(panel.yaxis)
-    panel.set_xlabel("trials kept (%)")
-    panel.set_ylabel("RMSE of distance, with outliers (mm)")
-    panel.grid(which="both", linewidth=0.3)
-    panel.legend(fontsize=7)
+    explain(panel, "trials kept (%)", "RMSE of distance, with outliers (mm)", grid="both", legend="best")
     return figure
 
 
@@ -161,10 +153,10 @@ def roc(trials: SweepTrials) -> Figure:
     strange = trials.true_class < 0
     for m, method in enumerate(trials.methods):
         score = np.where(trials.found[:, m] < 0, -1.0, np.nan_to_num(trials.p_value[:, m], nan=-1.0))
-        x, y = np.sort(score[strange]), np.sort(score[~strange])
-        limits = np.unique(np.concatenate([x, y, [-2.0, 2.0]]))[::-1]
-        strangers = 1 - np.searchsorted(x, limits) / len(x)
-        landmarks = 1 - np.searchsorted(y, limits) / len(y)
+        limits = np.unique([*score, -2.0, 2.0])[::-1]
+        strangers, landmarks = (
+            1 - np.searchsorted(np.sort(score[rows]), limits) / rows.sum() for rows in (strange, ~strange)
+        )
         area = float(np.trapezoid(landmarks, strangers))
         colour, mark, stroke = style(m)
         keep = np.unique(np.linspace(0, len(limits) - 1, min(len(limits), _MOST_POINTS)).astype(int))
@@ -172,16 +164,12 @@ def roc(trials: SweepTrials) -> Figure:
             100 * strangers[keep], 100 * landmarks[keep], color=colour, linestyle=stroke,
             label=f"{as_written(method)}, area {area:.3f}",
         )  # fmt: skip
-        accepted = [
-            binomial_interval(int(trials.accepted[rows, m].sum()), int(rows.sum()), law="student")
+        x, y = (
+            binomial_interval(int(trials.accepted[rows, m].sum()), int(rows.sum()), law="student").scaled(100)
             for rows in (strange, ~strange)
-        ]
-        at = [100 * one.value for one in accepted]
-        bars = [[[100 * (one.value - one.low)], [100 * (one.high - one.value)]] for one in accepted]
-        panel.errorbar(at[0], at[1], bars[1], bars[0], marker=mark, color=colour, markersize=5, capsize=2)
+        )
+        across, up = ([[one.value - one.low], [one.high - one.value]] for one in (x, y))
+        panel.errorbar(x.value, y.value, up, across, marker=mark, color=colour, markersize=5, capsize=2)
     panel.plot([0, 100], [0, 100], color="black", linewidth=0.6, linestyle=":", label="by lot")
-    panel.set_xlabel("strangers accepted (%)")
-    panel.set_ylabel("landmarks accepted (%)")
-    panel.grid(linewidth=0.3)
-    panel.legend(fontsize=7, loc="lower right")
+    explain(panel, "strangers accepted (%)", "landmarks accepted (%)", legend="lower right")
     return figure
