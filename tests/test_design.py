@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ from phasemark.matcher.design.position_bound import box_alone
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.separation import upper_appearance
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
-from phasemark.matcher.statistics import Interval, ratio_interval, rms_interval
+from phasemark.matcher.statistics import ratio_interval, rms_interval
 from phasemark.render import Renderer, Views, capture, preset
 
 NEAR, FAR = 0.8, 2.0
@@ -112,17 +112,14 @@ def test_a_mistake_in_the_plan_names_file_key_and_value(tmp_path, text, said):
     assert said in str(error.value)
 
 
-def test_a_plan_that_cannot_be_read_is_a_bad_file(tmp_path):
-    with pytest.raises(InputFileError, match="cannot be read"):
-        read_design_plan(tmp_path / "none.toml")
-
-
 def _sensor_file(path, **changes):
     fields = {**preset("pmd-16x16").model_dump(mode="json", exclude_none=True), **changes}
     path.write_text("".join(f"{key} = {json.dumps(value)}\n" for key, value in fields.items()))
 
 
 def test_a_sensor_file_is_relative_to_the_plan(tmp_path):
+    with pytest.raises(InputFileError, match="cannot be read"):
+        read_design_plan(tmp_path / "plan.toml")
     _sensor_file(tmp_path / "cam.toml", half_angle_h_deg=15.0)
     (tmp_path / "plan.toml").write_text('sensor = "cam.toml"\n')
     assert read_design_plan(tmp_path / "plan.toml").build_sensor().half_angle_h_deg == 15.0
@@ -169,12 +166,9 @@ def test_in_view_as_a_whole_is_what_projection_says():
                 assert rule is None or checks[rule] == inside
 
 
-def test_the_catalogue_keeps_the_geometric_rules_of_the_default_plan(room):
+def test_the_catalogue_keeps_the_geometric_rules_and_a_broken_one_says_its_number_and_its_limit(room):
     for spec in catalog().values():
         assert [str(check) for check in room.checks(spec) if not check.passes] == []
-
-
-def test_a_rule_says_its_number_and_its_limit(room):
     wide = LandmarkSpec(name="wide", box=Box(length_m=0.31, width_m=0.05, height_m=0.1))
     broken = {check.rule: check for check in room.checks(wide) if not check.passes}
     assert set(broken) == {"extent x'", "in view sideways, near end", "edges of the box resolvable, far end"}
@@ -223,25 +217,19 @@ def test_the_position_bound_is_the_trace_of_the_positions_covariance():
     assert bound.worst_m == pytest.approx(expected, rel=1e-3)
 
 
-def test_the_other_half_of_a_period_is_a_mirror_image():
+def test_neither_the_mirror_side_nor_an_upper_part_changes_the_bound_of_the_lower_pixels():
     plan = default_design()
-    spec = box_alone(Box(length_m=0.24, width_m=0.16, height_m=0.15), plan)
+
+    def bound(spec, delta_rad):
+        distance_m = np.array([0.9, 2.0])
+        return range_bound(spec, plan.build_sensor(), plan, distance_m=distance_m, delta_rad=delta_rad).position_std_m
+
+    post = catalog()["post"]
     delta = np.radians([13.0, 41.0, 77.0])
-    one, other = (
-        range_bound(spec, plan.build_sensor(), plan, distance_m=np.array([0.9, 1.7]), delta_rad=side).position_std_m
-        for side in (delta, math.pi - delta)
-    )
+    alone = bound(box_alone(post.box, plan), delta)
     # slopes are differences over 1e-5 of an integral good to 1e-8 or so
-    np.testing.assert_allclose(one, other, rtol=1e-3)
-
-
-def test_the_upper_part_does_not_change_the_bound_of_the_lower_pixels():
-    plan = default_design()
-    bounds = [
-        range_bound(spec, plan.build_sensor(), plan, distance_m=np.array([2.0]), delta_rad=np.radians([10.0, 50.0]))
-        for spec in (catalog()["post"], box_alone(catalog()["post"].box, plan))
-    ]
-    np.testing.assert_allclose(bounds[0].position_std_m, bounds[1].position_std_m, rtol=5e-3)  # kinks, PHYSICS 7
+    np.testing.assert_allclose(bound(box_alone(post.box, plan), math.pi - delta), alone, rtol=1e-3)
+    np.testing.assert_allclose(bound(post, delta)[1], alone[1], rtol=5e-3)  # kinks, PHYSICS 7
 
 
 # distinguishing landmarks
@@ -268,13 +256,9 @@ def test_the_distance_of_two_classes_is_the_matchers_cost_without_noise(design):
         expected = total.min() + penalty
         # ranges of mixed pixels bend over the shift of some millimetres
         assert cost - gradient**2 / (box_information + information) == pytest.approx(expected, rel=0.02)
-
-
-def test_classes_that_look_the_same_are_not_apart(design):
-    seen = upper_appearance(Cylinder(radius_m=0.05, height_m=0.1), design.search.sensor, design.plan)
-    d = ClassDistances.between([seen, seen]).least(np.full(3, 1e5))
-    assert d[0, 1] == 0
-    assert np.isinf(np.diag(d)).all()
+    alike = ClassDistances.between(seen[:1] * 2).least(np.full(3, 1e5))
+    assert alike[0, 1] == 0
+    assert np.isinf(np.diag(alike)).all()
 
 
 def test_confusion_follows_the_distance_of_classes():
@@ -344,15 +328,11 @@ def test_shapes_that_are_tried_lie_on_the_lattice_and_keep_the_limits(room):
         assert width <= length
         box = Box(length_m=length / 1000, width_m=width / 1000, height_m=height / 1000)
         assert all(check.passes for check in room.checks(box_alone(box, plan)))
-    assert {length == width for length, width, _ in boxes} == {True, False}
+    for symmetry, square in (("any", {True, False}), (2, {False}), (4, {True})):
+        tried = sample_boxes(DesignPlan(symmetry=symmetry), room, lattice)
+        assert {length == width for length, width, _ in tried} == square
     uppers = sample_uppers(plan, room, lattice)
     assert {type(upper) for upper in uppers} == {Cylinder, Cone, Sphere, Revolution}
-
-
-@pytest.mark.parametrize(("symmetry", "square"), [(2, {False}), (4, {True})])
-def test_the_plan_chooses_square_or_oblong_boxes(room, symmetry, square):
-    plan = DesignPlan(symmetry=symmetry)
-    assert {a == b for a, b, _ in sample_boxes(plan, room, Lattice(1.0))} == square
 
 
 def test_neighbours_differ_in_one_dimension_by_the_step():
@@ -381,20 +361,16 @@ def test_a_design_keeps_every_rule_and_beats_the_catalogue(design):
         assert (build_mesh(spec).extents <= np.array(design.plan.limits.extents_m) + 1e-6).all()
 
 
-def test_refining_does_not_lose_what_the_search_found(design):
+def test_refining_loses_nothing_and_no_feasible_candidate_beats_one_of_the_front_in_both(design):
     tried = [c for c in design.candidates if c.feasible and not c.refined]
     assert design.chosen.bound.worst_m <= min(c.bound.worst_m for c in tried)
     # the same measure: cached appearances of the parts, on the chosen box
     assert design.result.class_distance >= design.chosen.class_distance * (1 - 1e-9)
-
-
-def test_no_feasible_candidate_beats_one_of_the_front_in_both(design):
     front = design.front()
     assert front
-    for one in front:
-        for other in design.candidates:
-            better = other.bound.worst_m < one.bound.worst_m and other.class_distance > one.class_distance
-            assert not (other.feasible and better)
+    for one, other in product(front, design.candidates):
+        better = other.bound.worst_m < one.bound.worst_m and other.class_distance > one.class_distance
+        assert not (other.feasible and better)
 
 
 def test_the_same_plan_gives_the_same_design(design):
@@ -424,27 +400,14 @@ def test_the_worst_side_is_measured_with_fresh_frames(confirmed):
         assert not np.isin(confirmation.worst.error_m, confirmation.sides.error_m).any()
 
 
-def test_the_interval_of_a_root_mean_square_covers_the_truth():
-    rng = np.random.default_rng(5)
-    inside = 0
+def test_the_intervals_of_a_root_mean_square_and_of_a_ratio_of_two_cover_the_truth():
+    rng, inside = np.random.default_rng(5), np.zeros(2, int)
     for _ in range(400):
-        one = rms_interval(rng.normal(0, 2, 300), law="normal")
-        inside += one.low <= 2 <= one.high
+        two, three = (rms_interval(rng.normal(0, std, 300), law="normal") for std in (2, 3))
+        quotient = ratio_interval(three, two)
+        inside += two.low <= 2 <= two.high, quotient.low <= 1.5 <= quotient.high
     low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
-    assert low <= inside <= high
-
-
-def test_the_interval_of_a_ratio_covers_the_truth():
-    rng = np.random.default_rng(6)
-    inside = 0
-    for _ in range(400):
-        quotient = ratio_interval(
-            rms_interval(rng.normal(0, 3, 300), law="normal"), rms_interval(rng.normal(0, 2, 300), law="normal")
-        )
-        inside += quotient.low <= 1.5 <= quotient.high
-    low, high = stats.binom.ppf([0.0005, 0.9995], 400, 0.95)
-    assert low <= inside <= high
-    assert isinstance(quotient, Interval)
+    assert ((low <= inside) & (inside <= high)).all()
 
 
 # meshes and files
@@ -503,9 +466,7 @@ def test_the_command_writes_and_refuses_to_overwrite(tmp_path, capsys):
     assert main(arguments) == 4
     assert "exists already" in capsys.readouterr().err
     assert main(["bank", "build", str(out / "landmarks.toml"), "--dry-run", "-o", str(out / "bank.h5")]) == 0
-
-
-def test_the_command_prints_the_default_plan(capsys):
+    capsys.readouterr()
     assert main(["landmark", "design", "--example"]) == 0
     assert capsys.readouterr().out == example_design()
 

@@ -111,17 +111,14 @@ def test_views_lie_beyond_the_last_angle_where_the_grid_closes(tmp_path, monkeyp
     assert 150 < np.rad2deg(np.concatenate(seen)).max() < 180
 
 
-def test_a_planar_bank_is_tested_without_refinement(tmp_path):
+def test_a_planar_bank_is_tested_without_refinement_and_a_grid_without_spacing_is_refused(tmp_path):
     plan = BankPlan(classes=["cone"], distance_m="0.9:1.1:0.02", delta_deg="0:90:2", model="planar")
     with build_bank(plan, tmp_path / "bank.h5") as bank:
         loss = grid_loss(bank, 100)
     assert loss.refined is None
     assert loss.nearest.distance_rms_m == pytest.approx(0.02 / math.sqrt(12), rel=0.25)
-
-
-def test_a_grid_without_spacing_is_refused(tmp_path):
     with (
-        build_bank(BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:30"), tmp_path / "bank.h5") as bank,
+        build_bank(plan.model_copy(update={"distance_m": (1.0,)})) as bank,
         pytest.raises(UsageError, match="one distance or one angle only"),
     ):
         grid_loss(bank, 10)

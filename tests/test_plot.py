@@ -7,6 +7,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.style import Style
 
+import phasemark.render
 from phasemark import UsageError
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.render import Background, Flag, Frames, PhasorImages, Renderer, Views, capture, preset
@@ -92,10 +93,12 @@ def test_nothing_returned_is_hatched_and_named():
     assert "no range" not in texts(range_figure(np.ones((16, 16))))
 
 
-@pytest.mark.parametrize("image", [np.full((16, 16), np.nan), np.full((16, 16), 2.0)])
-def test_empty_and_flat_images_can_be_drawn(image):
-    assert png_size(range_figure(image))[0] > 300
-    assert "m" in terminal_figure(image).plain
+def test_empty_and_flat_images_can_be_drawn_and_no_stack_of_images():
+    for image in (np.full((16, 16), np.nan), np.full((16, 16), 2.0)):
+        assert png_size(range_figure(image))[0] > 300
+        assert "m" in terminal_figure(image).plain
+    with pytest.raises(UsageError, match=r"must be one image, \(rows, cols\), got shape \(1, 16, 16\)"):
+        range_figure(range_image()[None])
 
 
 def test_images_and_frames_can_be_drawn_for_a_first_look():
@@ -147,22 +150,14 @@ def test_terminal_picture_fills_the_width_by_whole_pixels():
     assert "\x1b[38;2;255;255;255" in stream.getvalue()
 
 
-def test_pictures_are_of_one_image():
-    with pytest.raises(UsageError, match=r"must be one image, \(rows, cols\), got shape \(1, 16, 16\)"):
-        range_figure(range_image()[None])
-
-
 def test_unknown_names_are_attribute_errors():
-    import phasemark.render
-
     with pytest.raises(AttributeError, match="has no attribute 'nonsense'"):
         getattr(phasemark.render, "nonsense")  # noqa: B009
 
 
-def test_the_colours_span_the_landmark_and_not_the_wall_behind_it():
-    image = Renderer(build_mesh(catalog()["cone"]), preset("pmd-16x16")).render(
-        1.0, 0.5, background=Background(wall_m=3.0)
-    )
+def test_the_colours_of_an_image_and_of_a_frame_span_the_landmark_and_not_the_wall_behind_it():
+    sensor = preset("pmd-16x16")
+    image = Renderer(build_mesh(catalog()["cone"]), sensor).render(1.0, 0.5, background=Background(wall_m=3.0))
     near, far = landmark_limits_m(image.range_m[0], image.coverage[0])
     whole = image.range_m[0][image.coverage[0] > 0.999]
     assert 0.8 < near < 0.95
@@ -172,13 +167,11 @@ def test_the_colours_span_the_landmark_and_not_the_wall_behind_it():
     axes = image.plot().axes[0]
     assert axes.images[0].get_clim() == (near, far)
     assert axes.images[0].colorbar.extend in ("max", "both")
-
-
-def test_without_a_landmark_the_colours_span_the_image():
-    assert landmark_limits_m(np.full((2, 2), 1.0), np.zeros((2, 2))) == (None, None)
-    assert landmark_limits_m(np.full((2, 2), np.nan), np.ones((2, 2))) == (None, None)
-    near, far = landmark_limits_m(np.full((2, 2), 1.0), np.ones((2, 2)))
-    assert far - near == pytest.approx(0.02)
+    frames = capture(image, sensor, rng=np.random.default_rng(3), n_frames=2)
+    for coverage in (image.coverage[0], None):
+        near, far = frames.plot(0, 1, coverage=coverage).axes[0].images[0].get_clim()
+        assert 0.75 < near < 0.95
+        assert 1.0 < far < 1.3  # the wall stands at 3 m
 
 
 def test_residuals_in_sigma_have_one_scale():
@@ -198,14 +191,7 @@ def test_without_anything_beside_it_no_part_of_the_landmark_is_beyond_the_colour
     noisy = image.range_m[0].copy()
     noisy[np.unravel_index(np.nanargmax(noisy), noisy.shape)] = 9.0  # one weak pixel
     assert landmark_limits_m(noisy, image.coverage[0])[1] < far
-
-
-@pytest.mark.parametrize("known", [True, False])
-def test_the_colours_of_a_frame_span_the_landmark(known):
-    sensor = preset("pmd-16x16")
-    image = Renderer(build_mesh(catalog()["cone"]), sensor).render(1.0, 0.5, background=Background(wall_m=3.0))
-    frames = capture(image, sensor, rng=np.random.default_rng(3), n_frames=2)
-    shown = frames.plot(0, 1, coverage=image.coverage[0] if known else None).axes[0].images[0]
-    near, far = shown.get_clim()
-    assert 0.75 < near < 0.95
-    assert 1.0 < far < 1.3  # the wall stands at 3 m
+    assert landmark_limits_m(np.full((2, 2), 1.0), np.zeros((2, 2))) == (None, None)
+    assert landmark_limits_m(np.full((2, 2), np.nan), np.ones((2, 2))) == (None, None)
+    near, far = landmark_limits_m(np.full((2, 2), 1.0), np.ones((2, 2)))
+    assert far - near == pytest.approx(0.02)

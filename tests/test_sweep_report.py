@@ -87,6 +87,14 @@ def test_the_report_is_one_page_that_loads_nothing(folder):
     for link in re.findall(r'href="([^"]*)"', page):
         assert f'id="{link[1:]}"' in page if link.startswith("#") else (folder / link).is_file()
     assert "<script" not in page
+    tags = re.findall(r"<(/?)([a-z][a-z0-9]*)", page)
+    paired = [("/" if end else "", name) for end, name in tags if name not in ("img", "meta", "br", "link")]
+    opened: list[str] = []
+    for end, name in paired:
+        assert not end or opened.pop() == name
+        opened += [] if end else [name]
+    assert opened == []
+    assert "numpy" in page.split("How it was made")[-1]
     figures = sorted(path.stem for path in (folder / "figures").glob("*.png"))
     assert figures == sorted(path.stem for path in (folder / "figures").glob("*.svg"))
     assert figures == sorted(
@@ -156,27 +164,16 @@ def test_the_command_at_the_end_makes_the_same_trials(folder, tmp_path, capsys):
         assert {**one, "seconds": ""} == {**other, "seconds": ""}
 
 
-def test_a_plan_that_is_no_plan_is_refused(tmp_path, capsys):
-    (tmp_path / "plan.json").write_text("[1]")
-    assert main(["sweep", "run", str(tmp_path / "plan.json"), "--out", str(tmp_path / "out")]) == 3
-    assert "cannot be read as the plan of a sweep" in capsys.readouterr().err
-
-
-def test_the_numbers_of_a_map_are_those_of_its_cells(folder):
+def test_the_numbers_of_a_map_are_those_of_its_cells_and_maps_of_ratios_share_one_scale_about_1(folder):
     cells = [cell for cell in read_sweep(folder)[1].cells() if not cell.stranger]
-    panel = next(axes for axes in maps(cells, "ratio").axes if axes.get_title() == "nearest: distance")
-    table = panel.images[0].get_array()
+    drawn = {axes.get_title(): axes.images[0] for axes in maps(cells, "ratio").axes if axes.images}
+    assert {image.get_clim() for image in drawn.values()} == {(0.25, 4.0)}
+    table = drawn["nearest: distance"].get_array()
     assert table.shape == (2, 2)  # two distances and two angles
     for (row, column), value in np.ndenumerate(table):
         where = "nearest", (0.95, 1.05)[row], (20.0, 70.0)[column]
         both = [c for c in cells if (c.method, c.condition.distance_m, c.condition.delta_deg) == where]
         assert value == pytest.approx(np.median([c.ratio["distance_m"].value for c in both]))
-
-
-def test_maps_of_ratios_share_one_scale_about_1(folder):
-    _, trials = read_sweep(folder)
-    figure = maps([cell for cell in trials.cells() if not cell.stranger], "ratio")
-    assert {axes.images[0].get_clim() for axes in figure.axes if axes.images} == {(0.25, 4.0)}
 
 
 def test_a_report_regenerates_bit_for_bit(folder):
@@ -223,13 +220,6 @@ def test_the_frames_of_a_trial_are_those_that_were_judged(folder, tmp_path):
     np.testing.assert_array_equal(read.range_m, sweep_frames(folder, 3, 7).range_m)
 
 
-def test_a_trial_that_was_never_made_is_refused(folder, capsys, tmp_path):
-    assert main(["sweep", "frames", str(folder), "99", "0", "-o", str(tmp_path / "one.npz")]) == 2
-    assert "has conditions 0 … 11, got 99" in capsys.readouterr().err
-    with pytest.raises(UsageError, match="has trials 0 … 11 of a condition, got 12"):
-        sweep_frames(folder, 0, 12)
-
-
 def test_strangers_have_no_error_and_are_right_if_refused(folder):
     _, trials = read_sweep(folder)
     for cell in trials.cells():
@@ -260,7 +250,9 @@ def test_the_bound_on_class_confusion_is_that_of_a_distance_that_grows_with_the_
 
 
 def test_a_hard_bank_holds_what_centre_rays_see():
-    with build_bank(hard_or_not("hard")) as bank:
+    method = Method(name="m", method="nearest", bank_model="hard", bank_step=(0.05, 5.0))
+    plan = SweepPlan(name="bank", classes=["cone"], bank_distance_m=(0.9, 1.1), methods=[method])
+    with build_bank(plan.bank_plan(method)) as bank:
         mesh = build_mesh(catalog()["cone"])
         seen = Renderer(mesh, bank.sensor, albedo=0.8).render(bank.distance_m[1], np.deg2rad(20), variant="hard")
         image = bank.image("cone", 1, 4)
@@ -270,16 +262,14 @@ def test_a_hard_bank_holds_what_centre_rays_see():
         np.testing.assert_allclose(image.phasor, seen.phasor, rtol=0, atol=1e-3)
 
 
-def hard_or_not(model):
-    method = Method(name="m", method="nearest", bank_model=model, bank_step=(0.05, 5.0))
-    return SweepPlan(name="bank", classes=["cone"], bank_distance_m=(0.9, 1.1), methods=[method]).bank_plan(method)
-
-
-def test_a_sweep_does_not_differ_from_itself(folder, capsys):
+def test_a_sweep_does_not_differ_from_itself_and_is_not_compared_with_other_conditions(folder, capsys):
     assert main(["sweep", "compare", str(folder), str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found
     assert not any(one["significant"] for one in found)
+    cells = linear_sweep(10, np.random.default_rng(1)).cells()
+    with pytest.raises(UsageError, match="share no condition"):
+        compare_cells(cells, read_sweep(folder)[1].cells())
 
 
 def test_a_matcher_that_is_3_mm_off_is_marked_and_its_angles_are_not(tmp_path):
@@ -307,22 +297,20 @@ def test_any_false_mark_at_all_has_the_probability_that_is_stated():
     assert any_marked <= stats.binom.ppf(0.999, runs, 0.05)
 
 
-def test_sweeps_that_share_no_condition_cannot_be_compared(folder):
-    cells = linear_sweep(10, np.random.default_rng(1)).cells()
-    with pytest.raises(UsageError, match="share no condition"):
-        compare_cells(cells, read_sweep(folder)[1].cells())
-
-
 def test_the_commands_tell_what_is_wrong_in_one_line(folder, tmp_path, capsys):
-    plan = tmp_path / "bad.toml"
+    plan, stored = tmp_path / "bad.toml", tmp_path / "bad.json"
     plan.write_text(PLAN.replace("[0.95, 1.05]", "[0.95, 1.2]"), encoding="utf-8")
+    stored.write_text("[1]")
     for arguments, code, message in (
         (["sweep", "run", "papper", "-o", str(tmp_path / "x")], 2, "unknown sweep 'papper': give paper, "),
         (["sweep", "run", str(plan), "-o", str(tmp_path / "x")], 2, r"bad.toml: axes: 'distance_m' must leave"),
         (["sweep", "run", "paper", "--trials", "0", "-o", str(tmp_path / "x")], 2, "'trials' must be greater"),
         (["sweep", "run", "paper", "-o", str(folder)], 4, "holds a sweep"),
         (["sweep", "run", "paper", "-o", str(folder), "--resume"], 4, "was begun with another plan"),
+        (["sweep", "run", str(stored), "-o", str(tmp_path / "x")], 3, "cannot be read as the plan of a sweep"),
         (["sweep", "report", str(tmp_path)], 3, "holds no sweep"),
+        (["sweep", "frames", str(folder), "99", "0", "-o", str(tmp_path / "x")], 2, "has conditions 0 … 11, got 99"),
+        (["sweep", "frames", str(folder), "0", "12", "-o", str(tmp_path / "x")], 2, "has trials 0 … 11 of a condition"),
     ):
         assert main(arguments) == code, arguments
         error = capsys.readouterr().err
@@ -342,13 +330,10 @@ def test_a_matcher_of_ones_own_joins_the_methods(folder, tmp_path, capsys, monke
     assert {cell["method"] for cell in cells} == {"nearest", "planar", "mean range", "own_matchers:off_by_3_mm"}
 
 
-@pytest.mark.parametrize("kind", ["nearest", "refine"])
-def test_bank_models_without_mixed_pixels_go_with_the_nearest_image_only(kind):
-    if kind == "nearest":
-        assert Method(name="a", method=kind, bank_model="hard").bank_model == "hard"
-        return
+def test_bank_models_without_mixed_pixels_go_with_the_nearest_image_only():
+    assert Method(name="a", method="nearest", bank_model="hard").bank_model == "hard"
     with pytest.raises(UsageError, match="'a' refines, which needs 'bank_model' ray, got hard"):
-        Method(name="a", method=kind, bank_model="hard")
+        Method(name="a", method="refine", bank_model="hard")
 
 
 def always_the_same(n: int = 60) -> SweepTrials:
