@@ -154,7 +154,7 @@ def _scored_facts(scored: Scored) -> dict[str, Any]:
             name: [
                 {
                     "rule": check.rule,
-                    "value": check.value,
+                    "value": float(check.value),
                     "at_most" if check.at_most else "at_least": check.limit,
                     "unit": check.unit,
                     "kept": check.passes,
