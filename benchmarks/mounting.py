@@ -19,8 +19,9 @@ from scipy.optimize import least_squares
 
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher.calibration import KnownPoses, Mounting, filter_poses
-from phasemark.matcher.calibration.mounting_fit import Fit
-from phasemark.matcher.calibration.mounting_model import NAMES, SCALE, STEP, CalibrationModel
+from phasemark.matcher.calibration.mounting import NAMES
+from phasemark.matcher.calibration.mounting_model import STEP, CalibrationModel
+from phasemark.matcher.calibration.still_fit import StillFit
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Frames, Renderer, Views, capture, preset
@@ -42,10 +43,10 @@ def mounting() -> dict[str, Any]:
         filtered = filter_poses([frames[k : k + 1] for k in range(POSES)], on)
         evidence = Evidence.from_frames(filtered, on)
         model = CalibrationModel(MESH, SENSOR, poses, albedo=ALBEDO)
-        fit = Fit(model, evidence, NAMES if on == "phasors" else NAMES[:-1], None, edges=True)
+        fit = StillFit(model, evidence, NAMES if on == "phasors" else NAMES[:-1], edges=True)
         begun = time.process_time()
         start = fit.start(Mounting.of_sensor(SENSOR, ALBEDO).vector)
-        use = fit.pixels(start, model.images(start, np.zeros((POSES, 3))))
+        use = fit.pixels(model.images(start))
         started = time.process_time()
         found = fit.search(fit.solve(start, use))
         fit.knowledge(found)
@@ -121,16 +122,15 @@ def command_seconds(folder: Path, frames: Frames, poses: KnownPoses, on: Residua
     return seconds
 
 
-def peer(fit: Fit, start: np.ndarray, use: np.ndarray) -> tuple[float, float]:
+def peer(fit: StillFit, start: np.ndarray, use: np.ndarray) -> tuple[float, float]:
     """Return processor seconds of SciPy's trust region solver on the same residuals and steps, and where it ended."""
-    evidence, scale = fit.evidence, SCALE[fit.columns]
+    evidence, scale = fit.evidence, fit.scale
     root = np.sqrt(np.where(use, evidence.weight, 0.0))
-    no_shift = np.zeros((len(use), 3))
 
     def residual(x: np.ndarray) -> np.ndarray:
         theta = start.copy()
         theta[fit.columns] += (x - 1) * scale
-        phasor = fit.model.images(theta, no_shift).phasor
+        phasor = fit.model.images(theta).phasor
         if evidence.on == "ranges":
             turned = np.angle(evidence.value * phasor.conj())
             lost = np.sqrt(DISAGREEMENT) * use

@@ -22,7 +22,7 @@ from real_recording import THICKNESS_M, Recording, read_recording
 from phasemark import PhasemarkError
 from phasemark.matcher import calibrate, kalman_filter
 from phasemark.matcher.calibration import KnownPoses
-from phasemark.matcher.calibration.mounting_model import PARAMETERS
+from phasemark.matcher.calibration.mounting import PARAMETERS
 from phasemark.matcher.calibration.report import residual_figure
 from phasemark.matcher.calibration.result import shown, shown_std
 from phasemark.render import preset

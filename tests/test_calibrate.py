@@ -21,9 +21,11 @@ from phasemark.matcher import calibrate, kalman_filter
 from phasemark.matcher.calibration import KnownPoses, Mounting, PoseStd, filter_poses, frames_of_poses, read_poses
 from phasemark.matcher.calibration import calibration as calibration_module
 from phasemark.matcher.calibration.judgement import likely_cause
-from phasemark.matcher.calibration.mounting_fit import Fit
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, NAMES, PARAMETERS, CalibrationModel
+from phasemark.matcher.calibration.mounting import NAMES, PARAMETERS, columns_of
+from phasemark.matcher.calibration.mounting_model import CalibrationModel
 from phasemark.matcher.calibration.pose_track import PoseTrack
+from phasemark.matcher.calibration.still_fit import StillFit
+from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
@@ -73,9 +75,15 @@ def filtered(frames, on="auto"):
 
 
 def nees(found, truth):
-    columns = [NAMES.index(name) for name in found.free]
-    error = (found.mounting.vector - truth.vector)[columns]
+    error = (found.mounting.vector - truth.vector)[columns_of(found.free)]
     return float(error @ np.linalg.solve(found.covariance, error))
+
+
+def recorded(seed, n, on="auto", albedo=0.8, **options):
+    """Return a mounting, n poses, and the filtered frames of a camera that is mounted so."""
+    rng = np.random.default_rng(seed)
+    truth, poses = some_mounting(rng, albedo), some_poses(rng, n)
+    return truth, poses, filtered(take(truth, poses, rng, **options), on)
 
 
 def trial(seed, n_poses=8, *, on="phasors", background=None, light=True, uncertain=False, free=None):
@@ -98,13 +106,10 @@ def phasor_trials():
     return [trial(seed, 6) for seed in range(2)]
 
 
-def test_true_mountings_lie_within_their_ellipses_on_phasors(phasor_trials):
+def test_true_mountings_lie_within_their_ellipses_on_phasors_and_fits_pass_their_test(phasor_trials):
     # the sum of 2 NEES of 8 numbers is χ²(16); 99.9 % corrected for the 3 tests of this kind in the file
     total = sum(value for value, _ in phasor_trials)
     assert stats.chi2.ppf(1e-3 / 6, 16) < total < stats.chi2.ppf(1 - 1e-3 / 6, 16)
-
-
-def test_the_fit_itself_passes_its_test(phasor_trials):
     for _, found in phasor_trials:
         assert found.p_value > 1e-3 / 2  # 99.9 % over the trials
 
@@ -116,14 +121,13 @@ def test_true_mountings_lie_within_their_ellipses_on_ranges_without_amplitudes()
 
 
 def test_small_minima_on_ranges_are_left_for_the_one_next_to_the_truth():
-    rng = np.random.default_rng([2026, 318])  # one of thirty: descending alone ends 7 above
-    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
-    evidence = Evidence.from_frames(filtered(take(truth, poses, rng), "ranges"), "ranges")
+    truth, poses, frames = recorded([2026, 318], 8, "ranges")  # one of thirty: descending alone ends 7 above
+    evidence = Evidence.from_frames(frames, "ranges")
     model = CalibrationModel(MESH, PMD, poses, albedo=0.8)
-    fit = Fit(model, evidence, NAMES[:-1], None, edges=True)
+    fit = StillFit(model, evidence, NAMES[:-1], edges=True)
 
     def solved(theta):
-        return fit.search(fit.solve(theta, fit.pixels(theta, model.images(theta, np.zeros((8, 3))), cautious=True)))
+        return fit.search(fit.solve(theta, fit.pixels(model.images(theta), cautious=True)))
 
     found, right = solved(fit.start(Mounting.of_sensor(PMD, 0.8).vector)), solved(truth.vector)
     assert (found.use == right.use).all()
@@ -148,9 +152,8 @@ def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
 
 def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_the_model_tells():
     """Five frames do not tell their noise, so it says nothing of which pixels are faint."""
-    rng = np.random.default_rng([77, 0])
-    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 8)
-    found = calibrate(MESH, filtered(take(truth, poses, rng, n_frames=5, light=False), "ranges"), poses, on="ranges")
+    truth, poses, frames = recorded([77, 0], 8, n_frames=5, light=False)
+    found = calibrate(MESH, frames, poses, on="ranges")
     assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
 
 
@@ -185,10 +188,8 @@ def test_a_wall_behind_tells_the_albedo_from_ranges():
 
 
 def test_an_unknown_background_leaves_the_edges_out_and_says_so():
-    rng = np.random.default_rng(61)
-    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 5)
-    frames = take(truth, poses, rng, background=Background(wall_m=3.0))
-    found = calibrate(MESH, filtered(frames, "ranges"), poses, on="ranges")
+    truth, poses, frames = recorded(61, 5, "ranges", background=Background(wall_m=3.0))
+    found = calibrate(MESH, frames, poses, on="ranges")
     assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
     assert any("edges were left out" in note for note in found.notes)
 
@@ -208,9 +209,9 @@ def test_slopes_by_offset_and_albedo_are_those_of_the_closed_form():
     """S ∝ ρ · exp(4πi f offset / c): the logarithmic slopes are 1/ρ and i · 4πf/c."""
     poses = KnownPoses.polar([1.0], [0.3])
     model = CalibrationModel(MESH, PMD, poses, albedo=0.8)
-    theta, shift = Mounting.of_sensor(PMD, 0.8).vector, np.zeros((1, 3))
-    phasor = model.images(theta, shift).phasor
-    slope, _ = model.slopes(theta, shift, ("range_offset", "albedo"), "phasors")
+    theta = Mounting.of_sensor(PMD, 0.8).vector
+    phasor = model.images(theta).phasor
+    slope = model.slopes(theta, ("range_offset", "albedo"), "phasors")
     lit = phasor[0] != 0
     np.testing.assert_allclose(slope[0, 0, lit] / phasor[0, lit], 1j / PMD.metres_per_radian, rtol=1e-12)
     np.testing.assert_allclose(slope[0, 1, lit] / phasor[0, lit], 1 / 0.8, rtol=1e-12)
@@ -302,6 +303,7 @@ def test_pose_errors_are_those_of_moved_lenses_and_turned_cameras():
         ("distance_m,delta_deg\n120,30\n", "line 2: the lens is 120 m from the landmark"),
         ("distance_m,delta_deg\n-1,30\n", "line 2: the lens is -1 m from the landmark"),
         ("distance_m,delta_deg,frames\n1,30,2.5\n", "line 2: 'frames' must be a number of frames, got 2.5"),
+        ("t_s,t_ms,distance_m,delta_deg\n1,1000,1.0,0\n", "state the same stamps twice"),
     ],
 )
 def test_a_file_of_poses_that_is_none_is_refused_in_one_line(tmp_path, text, part):
@@ -314,13 +316,17 @@ def test_a_file_of_poses_that_is_none_is_refused_in_one_line(tmp_path, text, par
     assert "\n" not in str(refused.value)
 
 
-def test_semicolons_and_decimal_commas_are_read(tmp_path):
+def test_poses_are_read_with_semicolons_decimal_commas_and_stamps(tmp_path):
     (tmp_path / "poses.csv").write_text("# measured on Monday\ndistance_m;delta_deg;frames\n1,25;30;50\n\n0,9;-15;20\n")
     poses = read_poses(tmp_path / "poses.csv")
     np.testing.assert_allclose(poses.distance_m, [1.25, 0.9])
     np.testing.assert_allclose(poses.delta_rad, [30 * DEGREE, -15 * DEGREE])
     assert poses.frames.tolist() == [50, 20]
     assert poses.where(1).endswith("line 5")
+    (tmp_path / "ms.csv").write_text("t_ms,distance_m,delta_deg\n500,1.0,0\n567,1.1,3\n")
+    np.testing.assert_allclose(read_poses(tmp_path / "ms.csv").time_s, [0.5, 0.567])
+    (tmp_path / "s.csv").write_text("x_m,y_m,heading_deg,t_s\n-1,0,0,2.5\n")
+    np.testing.assert_allclose(read_poses(tmp_path / "s.csv").time_s, [2.5])
 
 
 def test_frames_of_one_file_go_to_the_poses_in_turn():
@@ -456,15 +462,23 @@ def test_with_the_calibrated_sensor_distance_side_and_heading_are_at_the_bound(f
     assert abs(wrong.mean(axis=0)).min() > 3 * abs(right.mean(axis=0)).max()
 
 
-def test_what_is_stated_and_fixed_is_in_the_sensor_too():
+def test_few_poses_take_few_numbers_and_what_is_stated_and_fixed_is_in_the_sensor_too():
     poses = KnownPoses.polar([0.9, 1.2, 1.4], [0.1, 0.4, 0.9])
     raised = replace(Mounting.of_sensor(PMD, 0.8), height_m=0.02)
-    frames = take(raised, poses, np.random.default_rng(3), n_frames=10)
-    found = calibrate(MESH, filtered(frames), poses, free=("pitch",), start=raised)
+    frames = filtered(take(raised, poses, np.random.default_rng(3), n_frames=10))
+    found = calibrate(MESH, frames, poses, free=("pitch",), start=raised)
     assert (found.sensor.height_offset_m, found.sensor.bearing_offset_deg) == (0.02, 0.0)
-    again = calibrate(MESH, replace(filtered(frames), sensor=found.sensor), poses, free=("pitch",))
-    assert again.mounting.height_m == 0.02  # a sensor file is where the next calibration starts
+    frames = replace(frames, sensor=found.sensor)  # a sensor file is where the next calibration starts
+    two = slice(0, 2)
+    again = calibrate(MESH, frames[two], poses[two], free=("pitch",))  # one number takes one pose
+    assert again.mounting.height_m == 0.02
     assert abs(again.value("pitch")) < 4 * again.std("pitch")
+    with pytest.raises(UsageError, match=r"too few poses: 2, but .* take at least 3"):
+        calibrate(MESH, frames[two], poses[two])
+    state = frames.state.copy()
+    state[1] = PixelState.NO_RETURN
+    with pytest.raises(UsageError, match="pose 1: 0 pixels returned: was the landmark in view"):
+        calibrate(MESH, replace(frames, state=state), poses)
 
 
 @pytest.mark.parametrize(
@@ -485,6 +499,10 @@ def test_what_is_stated_and_fixed_is_in_the_sensor_too():
         ({}, ["--class", "cone"], 2, "--class belongs to a bank"),
         ({}, ["--plot", "x.pdf"], 2, "must be a .png file"),
         ({}, ["--wall", "0.5"], 2, "'wall_m' must be at least"),
+        ({}, ["--moving"], 2, "the frames have no time stamps"),
+        ({}, ["--free", "delay"], 2, "the delay takes a moving camera: give --moving"),
+        ({}, ["--delay-ms", "-75"], 2, "--delay-ms takes --moving"),
+        ({}, ["--zones"], 2, "offsets of zones belong to sensors of 'kind' = 'direct'"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, options, more, code, part):
@@ -493,23 +511,6 @@ def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, op
     assert part in error[-1]
     assert error[-1].startswith("error: ")
     assert not (tmp_path / "cam.toml").exists()
-
-
-def test_two_poses_are_too_few():
-    poses = KnownPoses.polar([0.9, 1.2], [0.1, 0.4])
-    frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(3), n_frames=10)
-    with pytest.raises(UsageError, match=r"too few poses: 2, but .* take at least 3"):
-        calibrate(MESH, filtered(frames), poses)
-    found = calibrate(MESH, filtered(frames), poses, free=("range_offset",))  # one number takes no more
-    assert abs(found.value("range_offset")) < 4 * found.std("range_offset")
-
-
-def test_an_empty_pose_is_named():
-    poses = KnownPoses.polar([0.9, 1.2, 1.4], [0.1, 0.4, 0.9])
-    frames = take(Mounting.of_sensor(PMD, 0.8), poses, np.random.default_rng(3), n_frames=10, light=False)
-    empty = Frames(np.where(np.arange(3)[:, None, None, None] == 1, np.nan, frames.range_m), sensor=PMD)
-    with pytest.raises(UsageError, match="pose 1: 0 pixels returned: was the landmark in view"):
-        calibrate(MESH, filtered(empty), poses)
 
 
 @pytest.mark.soak
@@ -564,20 +565,18 @@ def moved(seed, n=40):
     )  # fmt: skip
     frames, poses, zone = record(rng, truth, n)
     found = calibrate(BOARD, frames, poses, free=FREE, moving=True)
-    columns = [ALL_NAMES.index(name) for name in found.free]
-    error = (found.mounting.vector - truth.vector)[columns]
-    return float(error @ np.linalg.solve(found.covariance, error)), found, truth, zone
+    return nees(found, truth), found, truth, zone
 
 
 @pytest.fixture(scope="module")
 def rides():
-    return [moved(seed) for seed in (1, 2, 3)]
+    return [moved(seed) for seed in (1, 2)]
 
 
 def test_delay_zone_offsets_noise_and_mounting_are_found_at_once(rides):
-    """The sum of 3 NEES of 6 numbers is χ²(18)."""
+    """The sum of 2 NEES of 6 numbers is χ²(12)."""
     total = sum(value for value, *_ in rides)
-    assert stats.chi2.ppf(1e-3 / 2, 18) < total < stats.chi2.ppf(1 - 1e-3 / 2, 18)
+    assert stats.chi2.ppf(1e-3 / 2, 12) < total < stats.chi2.ppf(1 - 1e-3 / 2, 12)
     for _, found, truth, _ in rides:
         assert abs(found.value("delay") - truth.delay_s) < 4 * found.std("delay")
         assert found.std("delay") < 2e-3
@@ -610,14 +609,6 @@ def test_a_calibration_leaves_its_covariance_in_the_sensor_file(rides, tmp_path)
     assert after < 0.5 * before
 
 
-@pytest.mark.parametrize("delay_s", [-0.2, 0.05])
-def test_a_delay_is_found_far_from_where_it_was_assumed(delay_s):
-    rng = np.random.default_rng(8)
-    frames, poses, _ = record(rng, replace(TURNING, delay_s=delay_s))
-    found = calibrate(BOARD, frames, poses, free=FREE, moving=True)
-    assert abs(found.value("delay") - delay_s) < 4 * found.std("delay")
-
-
 def test_stamps_that_repeat_are_moved_into_a_gap_and_those_that_run_backwards_left_out():
     frames, poses, _ = record(np.random.default_rng(9), TURNING, 44)
     stamps, known = frames.time_s.copy(), poses.time_s.copy()
@@ -625,9 +616,8 @@ def test_stamps_that_repeat_are_moved_into_a_gap_and_those_that_run_backwards_le
     stamps[40] = stamps[39] = stamps[39] + 0.3 * (stamps[40] - stamps[39])  # which of the two is right is not known
     stamps[30] = stamps[28] + 0.01
     known[10], known[15] = known[9], known[12]
-    found = calibrate(
-        BOARD, replace(frames, time_s=stamps), replace(poses, time_s=known), free=FREE, moving=True
-    )  # fmt: skip
+    timed, poses = replace(frames, time_s=stamps), replace(poses, time_s=known)
+    found = calibrate(BOARD, timed, poses, free=FREE, moving=True)
     assert abs(found.value("delay") + 0.075) < 4 * found.std("delay")
     assert len(found.poses) == 44 - 3
     assert found.sensor.systematic_time_s >= stamp_jitter(stamps)
@@ -637,31 +627,28 @@ def test_stamps_that_repeat_are_moved_into_a_gap_and_those_that_run_backwards_le
     assert "3 frames were left out, for their stamps repeat or run backwards" in notes
 
 
-def test_gaps_between_poses_are_not_bridged():
+def test_gaps_between_poses_are_not_bridged_and_angles_are_unwrapped():
     time = np.concatenate([np.arange(0, 1, 0.05), np.arange(2, 3, 0.05)])
     track = PoseTrack.of(replace(ride(time, 0.0), time_s=time))
     assert track.known(np.array([0.5, 1.5, 2.5]), np.array([0.6, 1.6, 2.6])).tolist() == [True, False, True]
     value, rate = track.at(np.array([0.5, 2.5]))
     np.testing.assert_allclose(value[:, 2], ride(np.array([0.5, 2.5]), 0.0).bearing_rad, atol=2e-4)
     np.testing.assert_allclose(rate[:, 2], 22 * DEGREE * 1.9 * np.cos(1.9 * np.array([0.5, 2.5])), rtol=0.02)
-
-
-def test_angles_of_a_track_are_unwrapped():
     time = np.arange(0, 1, 0.05)
     delta = (3.0 + 0.5 * time + np.pi) % (2 * np.pi) - np.pi  # from +180° to −180° on the way
     track = PoseTrack.of(replace(KnownPoses.polar(1.0 + 0 * time, delta), time_s=time))
     np.testing.assert_allclose(np.cos(track.at(np.array([0.27, 0.29]))[0][:, 1] - [3.135, 3.145]), 1, atol=1e-9)
 
 
-def test_pixels_that_see_clutter_have_no_weight_and_their_share_is_told():
-    """A floor a few centimetres away in the lower two rows, which are told from the model alone."""
-    frames, poses, _ = record(np.random.default_rng(10), TURNING)
+def test_a_long_delay_is_found_and_pixels_that_see_clutter_have_no_weight():
+    """A floor a few centimetres away in the lower two rows, which are told from the model alone; a long delay."""
+    frames, poses, _ = record(np.random.default_rng(10), replace(TURNING, delay_s=-0.2))
     ranges = frames.range_m.copy()
     ranges[:, 6:] = 0.03
     found = calibrate(BOARD, replace(frames, range_m=ranges), poses, free=FREE, moving=True)
     assert found.left_out == pytest.approx(0.25, abs=0.01)
     assert np.isnan(found.residual_m[:, 6:]).all()
-    assert abs(found.value("delay") + 0.075) < 4 * found.std("delay")
+    assert abs(found.value("delay") + 0.2) < 4 * found.std("delay")
     assert abs(found.value("pitch") - 0.5 * DEGREE) < 4 * found.std("pitch")
 
 
@@ -689,9 +676,9 @@ def test_z_taken_for_range_is_doubted_with_its_cause(monkeypatch):
     """The search for the cause counts as progress, too: it takes as long as the fit."""
     steps, before = [], []
 
-    def searched(baseline, alternatives):
+    def searched(solution):
         before.append(len(steps))
-        return likely_cause(baseline, alternatives)
+        return likely_cause(solution)
 
     def step(done, total):
         steps.append(done)
@@ -722,30 +709,6 @@ def test_a_moving_camera_takes_time_stamps_in_one_clock_and_the_unit_stated():
     )
     with pytest.raises(UsageError, match="the delay cannot be determined from this recording"):
         calibrate(BOARD, replace(frames, range_m=frames.range_m[:1].repeat(20, axis=0)), still, free=FREE, moving=True)
-
-
-def test_poses_are_read_with_their_stamps(tmp_path):
-    (tmp_path / "poses.csv").write_text("t_ms,distance_m,delta_deg\n500,1.0,0\n567,1.1,3\n")
-    np.testing.assert_allclose(read_poses(tmp_path / "poses.csv").time_s, [0.5, 0.567])
-    (tmp_path / "s.csv").write_text("x_m,y_m,heading_deg,t_s\n-1,0,0,2.5\n")
-    np.testing.assert_allclose(read_poses(tmp_path / "s.csv").time_s, [2.5])
-    (tmp_path / "both.csv").write_text("t_s,t_ms,distance_m,delta_deg\n1,1000,1.0,0\n")
-    with pytest.raises(InputFileError, match="state the same stamps twice"):
-        read_poses(tmp_path / "both.csv")
-
-
-@pytest.mark.parametrize(
-    ("more", "part"),
-    [
-        (["--moving"], "the frames have no time stamps"),
-        (["--free", "delay"], "the delay takes a moving camera: give --moving"),
-        (["--delay-ms", "-75"], "--delay-ms takes --moving"),
-        (["--zones"], "offsets of zones belong to sensors of 'kind' = 'direct'"),
-    ],
-)
-def test_the_command_says_what_a_delay_takes(folder, tmp_path, capsys, more, part):
-    assert command(folder[0], tmp_path, *more) == 2
-    assert part in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, capsys, monkeypatch):

@@ -91,16 +91,13 @@ def test_frames_of_a_modulated_camera_are_judged_by_the_noise_of_each_pixel():
     assert motion_test(frames).p_value < 1e-6
 
 
-def test_too_few_frames_say_nothing():
+def test_too_few_frames_say_nothing_and_the_false_alarm_is_that_of_all_positions_of_a_file():
     test = motion_test(Frames(np.full((2, 1, 8, 8), 0.7), sensor=ZONES))
     assert test.p_value.tolist() == [1.0, 1.0]
     assert np.isnan(test.correlation).all()
     assert not test.moved().any()
     empty = motion_test(Frames(np.full((1, 9, 8, 8), np.nan), sensor=ZONES))
     assert empty.p_value.tolist() == [1.0]
-
-
-def test_the_false_alarm_is_that_of_all_positions_of_a_file():
     rng = np.random.default_rng(23)
     test = motion_test(Frames(noise(rng, 8, "normal")[:1000], sensor=ZONES))
     assert test.moved(0.5).sum() <= 5  # 0.5 expected at most; more than 5 in one of 10⁵ files

@@ -145,30 +145,23 @@ def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
     assert lines[2]["time_s"] == 0.133
 
 
-def test_answers_do_not_depend_on_the_size_of_a_batch(folder):
-    with open_bank(folder / "bank.h5") as bank:
-        frames = read_frames(
-            folder / "flight.csv", sensor=bank.sensor, quantity="z", valid_status=[5]
-        ).each_a_position()
-        matcher = Matcher(bank, "refine", background=Background(wall_m=1.5))
-        found = [
-            [match.as_dict() for batch in match_in_batches(matcher, frames, kalman_filter, at_once=at_once)
-             for match in batch.matches]
-            for at_once in (2, 256)
-        ]  # fmt: skip
-    assert len(found[0]) == N
-    assert found[0] == found[1]
-
-
-def test_a_single_frame_of_a_direct_sensor_has_the_noise_that_the_sensor_states(folder):
+def test_answers_do_not_depend_on_the_size_of_a_batch_and_single_frames_have_the_noise_that_the_sensor_states(folder):
     with open_bank(folder / "bank.h5") as bank:
         frames = read_frames(folder / "flight.csv", sensor=bank.sensor, quantity="z", valid_status=[5])
-        (batch,) = match_in_batches(Matcher(bank), frames.each_a_position(), kalman_filter)
-    returned = np.isfinite(batch.filtered.range_m)
+        matcher = Matcher(bank, "refine", background=Background(wall_m=1.5))
+        batches = [
+            list(match_in_batches(matcher, frames.each_a_position(), kalman_filter, at_once=at_once))
+            for at_once in (2, 256)
+        ]
+    found = [[match.as_dict() for batch in one for match in batch.matches] for one in batches]
+    assert len(found[0]) == N
+    assert found[0] == found[1]
+    filtered = batches[1][0].filtered
+    returned = np.isfinite(filtered.range_m)
     assert returned.any()
-    filtered = batch.filtered.with_pooled_noise()
-    assert (filtered.std_m[returned] == ZONES.range_std_m).all()
-    assert not filtered.std_from_scatter
+    pooled = filtered.with_pooled_noise()
+    assert (pooled.std_m[returned] == ZONES.range_std_m).all()
+    assert not pooled.std_from_scatter
 
 
 @pytest.mark.soak
@@ -237,20 +230,17 @@ def test_where_nothing_is_found_the_estimates_are_empty(run, folder, tmp_path):
     assert (row["index"], row["class"], row["accepted"], row["distance_m"]) == ("0", "", "false", "")
 
 
-def test_pictures_of_chosen_positions_come_after_the_table(run, folder, tmp_path, drawn):
-    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--plot", tmp_path / "m.png"]
+def test_pictures_come_after_the_table_of_chosen_positions_or_of_the_first(run, folder, tmp_path, drawn):
+    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--method", "nearest"]
+    match += ["--no-diagnosis", "--plot", tmp_path / "m.png"]
     code, out, err = run(*match, "--plot-index", "1,3:4")
     assert code == 0
     assert "note: drew" not in err
     assert {path.name for path in tmp_path.iterdir()} == {"m-1.png", "m-3.png", "m-4.png"}
     assert len(drawn[0].splitlines()) == 1 + N
     assert out.split() == [str(tmp_path / f"m-{k}.png") for k in (1, 3, 4)]
-
-
-def test_of_many_positions_the_first_is_drawn_unless_the_user_says_which(run, folder, tmp_path, drawn):
-    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, "--moving", "--plot", tmp_path / "m.png"]
     _, _, err = run(*match)
-    assert [path.name for path in tmp_path.iterdir()] == ["m-0.png"]
+    assert (tmp_path / "m-0.png").exists()
     assert f"note: drew the first of {N} positions; --plot-index 0,4:8 draws others" in err
 
 

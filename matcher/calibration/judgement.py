@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, PARAMETERS, SCALE, clipped
-from phasemark.matcher.calibration.notes import TITLES
-from phasemark.matcher.calibration.recording_fit import prior_std
+from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, clipped, prior_std
+from phasemark.matcher.calibration.mounting_model import natural_units
+from phasemark.matcher.calibration.problem import Problem, Solution
+from phasemark.matcher.calibration.recording_fit import RecordingFit
 
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""
@@ -18,77 +17,97 @@ _GREW = 1.02
 """Factor by which held-out residuals may grow: what counting other pixels may do."""
 _MOST_LEFT_OUT = 0.5
 """Share of the pixels on the landmark that may disagree with the model."""
+_DELAY_NOTED_S, _DELAY_GAIN = 0.015, 0.8
+"""A stated delay is doubted if one farther away lowers the mean square residual to that share."""
 _BETTER = 0.5
 """Mean square of the residuals of an alternative, over that of what was assumed, from which it is the likely cause."""
 
 
-def doubts_about(
-    theta: NDArray[np.float64],
-    assumed: NDArray[np.float64],
-    free: Iterable[str],
-    held_out_m: tuple[float, float],
-    left_out: float = 0.0,
-    *,
-    scale: NDArray[np.float64] = SCALE,
-) -> list[str]:
-    """List the reasons why a calibration cannot be trusted.
-
-    Parameters
-    ----------
-    theta, assumed : (21,) float64
-        What was found, and what was assumed.
-    free : iterable of str
-    held_out_m : (before, after)
-        Root mean square of held-out residuals, metres; NaN where it is not known.
-    left_out : float
-        Share of the pixels on the landmark that disagreed.
-    scale : (21,) float64
-        Natural units.
-
-    Returns
-    -------
-    list of str
-        Clauses; empty for a calibration that can be trusted.
-    """
+def doubts_about(solution: Solution) -> tuple[str, ...]:
+    """List the reasons why a calibration cannot be trusted, as clauses; none for one that can be."""
     doubts = []
-    for name in free:
+    theta, problem = solution.theta, solution.problem
+    assumed, scale = problem.assumed.vector, natural_units(problem.sensor)
+    for name in problem.names:
         if name == "albedo":
             continue
-        k, parameter = ALL_NAMES.index(name), PARAMETERS[name]
-        std = prior_std(name, assumed, scale)
-        moved = theta[k] - assumed[k]
-        at_bound = clipped(theta + 1e-9 * np.sign(moved))[k] != theta[k] + 1e-9 * np.sign(moved)
-        if abs(moved) > TRUSTED * std or at_bound:
-            space = "" if parameter.unit in ("", "°") else " "
+        k, one = ALL_NAMES.index(name), PARAMETERS[name]
+        most = TRUSTED * prior_std(name, assumed, scale)
+        beyond = theta + 1e-9 * np.sign(theta[k] - assumed[k])
+        if abs(theta[k] - assumed[k]) > most or clipped(beyond)[k] != beyond[k]:
             doubts.append(
-                f"the {TITLES[name]} ran to {parameter.shown * theta[k]:.3g}{space}{parameter.unit}, more than"
-                f" {parameter.shown * TRUSTED * std:.3g}{space}{parameter.unit} from the assumed"
-                f" {parameter.shown * assumed[k]:.3g}{space}{parameter.unit}"
+                f"the {one.title} ran to {one.text(theta[k])}, more than {one.text(most)} from the assumed"
+                f" {one.text(assumed[k])}"
             )
-    before, after = held_out_m
-    if math.isfinite(before) and math.isfinite(after) and after > _GREW * before:
+    before, after = solution.held_out_m
+    if after > _GREW * before:
         doubts.append(f"the residuals of held-out frames grew from {1e3 * before:.3g} to {1e3 * after:.3g} mm (r.m.s.)")
-    if left_out > _MOST_LEFT_OUT:
-        doubts.append(f"{100 * left_out:.0f} % of the pixels that should see the landmark disagree with it")
-    return doubts
+    if solution.left_out > _MOST_LEFT_OUT:
+        doubts.append(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
+    if problem.track is not None and "delay" not in problem.names:
+        fixed = RecordingFit(problem, edges=solution.edges)
+        freed = RecordingFit(replace(problem, names=(*problem.names, "delay")), edges=solution.edges)
+        with_it, without = freed.approach(), fixed.approach()
+        stated = problem.assumed.delay_s
+        moved = float(with_it[ALL_NAMES.index("delay")]) - stated
+        if abs(moved) >= _DELAY_NOTED_S and freed.misfit(with_it) <= _DELAY_GAIN * fixed.misfit(without):
+            doubts.append(f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * stated:.0f} ms")
+    return tuple(doubts)
 
 
-def likely_cause(baseline: float, alternatives: Iterable[tuple[str, Callable[[], tuple[float, str]]]]) -> str:
-    """Return the likely cause of a failure: the alternative that fits best, if it fits much better.
-
-    Parameters
-    ----------
-    baseline : float
-        Mean square residual with everything as stated, m².
-    alternatives : iterable of (name, fit)
-        Each fit returns its mean square residual and a sentence that says what would be right.
-    """
-    best, sentence = _BETTER * baseline, ""
-    for _, fit in alternatives:
-        found, said = fit()
+def likely_cause(solution: Solution) -> str:
+    """Return the likely cause of a failure: the change of a stated value that fits best, if it fits much better."""
+    stated = replace(solution.problem, names=tuple(name for name in solution.problem.names if name != "albedo"))
+    best, cause = _BETTER * _misfit(stated, solution.edges)[0], ""
+    for changed, sentence in _alternatives(stated):
+        found, delay_s = _misfit(changed, solution.edges)
         if found < best:
-            best, sentence = found, said
-    return sentence or (
+            best, cause = found, sentence.format(delay_ms=1e3 * delay_s)
+    return cause or (
         "no change of delay, quantity or order explains it: are the landmark and its size right, and do the poses refer"
         " to the lens and the landmark's axis?"
     )
+
+
+def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
+    """Return problems that differ from the stated one in one value, each with what would then be right."""
+    frames, poses, track, names = stated.frames, stated.poses, stated.track, stated.names
+    cosine, (right, wrong) = stated.sensor.axis_cosine(), ("range", "z") if stated.reports_z else ("z", "range")
+    quantity = replace(frames, range_m=frames.range_m * cosine if stated.reports_z else frames.range_m / cosine)
+    turned = replace(poses, delta_rad=-poses.delta_rad, bearing_rad=-poses.bearing_rad)
+    flipped = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
+    changed = [
+        (
+            replace(stated, frames=quantity, reports_z=not stated.reports_z),
+            f"the numbers are likely {right}, not {wrong}: give quantity={right}",
+        ),
+        (
+            replace(stated, poses=turned, track=None if track is None else track.mirrored()),
+            "angles of the poses likely have the other sign: counter-clockwise",
+        ),
+        (replace(stated, frames=replace(frames, **flipped)), "images are likely mirrored: give flip_h=True"),
+    ]
+    if track is None:
+        order = np.arange(len(poses))
+        changed += [
+            (replace(stated, poses=poses[which]), sentence)
+            for which, sentence in (
+                (order[::-1], "the poses are likely in the reverse order of the frames"),
+                (np.roll(order, 1), "each frame likely belongs to the pose before: check the order"),
+                (np.roll(order, -1), "each frame likely belongs to the next pose: check the order"),
+            )
+        ]
+    elif "delay" not in names:
+        late = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: leave the delay free"
+        changed.append((replace(stated, names=(*names, "delay")), late))
+    return changed
+
+
+def _misfit(problem: Problem, edges: bool) -> tuple[float, float]:
+    """Return the mean square residual (m²) and the delay (s) of the best mounting no farther than what can be."""
+    fit = RecordingFit(problem, edges=edges)
+    theta = fit.approach()
+    assumed, most = fit.assumed[fit.columns], TRUSTED * fit.prior * fit.scale
+    held = theta.copy()
+    held[fit.columns] = np.clip(theta[fit.columns], assumed - most, assumed + most)
+    return fit.misfit(held), float(theta[ALL_NAMES.index("delay")])

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
 from phasemark.inputs.table_cells import cells_of, finite_number
-from phasemark.render import Frames
 from phasemark.render.view import wrap_delta_rad
 
 POLAR = ("distance_m", "delta_deg")
@@ -82,16 +80,9 @@ class KnownPoses:
     def __getitem__(self, index: slice | NDArray[np.integer]) -> KnownPoses:
         """Return some of the poses."""
         which = np.arange(len(self))[index]
-        return KnownPoses(
-            self.distance_m[which],
-            self.delta_rad[which],
-            self.bearing_rad[which],
-            self.height_m[which],
-            None if self.wall_m is None else self.wall_m[which],
-            None if self.frames is None else self.frames[which],
-            tuple(self.place[k] for k in which) if self.place else (),
-            None if self.time_s is None else self.time_s[which],
-        )
+        place = tuple(self.place[k] for k in which) if self.place else ()
+        arrays = {name: values for name, values in vars(self).items() if name != "place"}
+        return KnownPoses(**{name: None if a is None else a[which] for name, a in arrays.items()}, place=place)
 
     def where(self, k: int) -> str:
         """Name one pose in a message."""
@@ -210,60 +201,54 @@ def read_poses(
     """
     path = Path(path)
     text = read_text(path, most_bytes=_MOST_BYTES)
-    lines = [(k, line) for k, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = [
+        (f"{path}, line {k}", line)
+        for k, line in enumerate(text.splitlines(), 1)
+        if line.strip() and not line.startswith("#")
+    ]
     if not lines:
         raise InputFileError(f"{path}: is empty; its columns must be {COLUMNS}")
-    separator = ";" if ";" in lines[0][1] else "\t" if "\t" in lines[0][1] else ","
-    table = [cells_of(line, f"{path}, line {number}", separator) for number, line in lines]
-    names = [name.strip() for name in table[0]]
+    separator = next((one for one in ";\t" if one in lines[0][1]), ",")
+    (_, header), *table = [(where, cells_of(line, where, separator)) for where, line in lines]
+    names = [name.strip() for name in header]
     is_polar = _check_header(path, names)
-    if len(table) == 1:
+    if not table:
         raise InputFileError(f"{path}: has a header and no poses")
     columns: dict[str, list[float]] = {name: [] for name in names}
-    for (number, _), cells in zip(lines[1:], table[1:], strict=True):
+    for where, cells in table:
         if len(cells) != len(names):
-            raise InputFileError(f"{path}, line {number}: {len(cells)} values, must have {len(names)}")
+            raise InputFileError(f"{where}: {len(cells)} values, must have {len(names)}")
         for name, cell in zip(names, cells, strict=True):
-            text = cell if separator == "," else cell.replace(",", ".")
-            columns[name].append(finite_number(text, f"{path}, line {number}", name))
-    place = tuple(f"{path}, line {number}" for number, _ in lines[1:])
+            columns[name].append(finite_number(cell if separator == "," else cell.replace(",", "."), where, name))
     values = {name: np.array(column) for name, column in columns.items()}
-    zero = np.zeros(len(place))
-    distances = values.get("distance_m")
-    if distances is None:
-        distances = np.hypot(values["x_m"] - landmark_xy_m[0], values["y_m"] - landmark_xy_m[1])
-    for where, distance in zip(place, distances, strict=True):
+    x, y = landmark_xy_m
+    distances = values["distance_m"] if is_polar else np.hypot(values["x_m"] - x, values["y_m"] - y)
+    for (where, _), distance, count in zip(table, distances, values.get("frames", np.ones(len(table))), strict=True):
         if not 0 < distance < _FARTHEST_M:
             raise InputFileError(
                 f"{where}: the lens is {distance:g} m from the landmark, must be more than 0 and less than"
                 f" {_FARTHEST_M:g} m: the columns are in metres"
             )
+        if count != int(count) or count < 1:
+            raise InputFileError(f"{where}: 'frames' must be a number of frames, got {count:g}")
     if is_polar:
-        bearing = np.radians(values.get("bearing_deg", zero))
-        seen = KnownPoses.polar(values["distance_m"], np.radians(values["delta_deg"]), bearing)
+        bearing_rad = np.radians(values.get("bearing_deg", 0.0))
+        poses = KnownPoses.polar(values["distance_m"], np.radians(values["delta_deg"]), bearing_rad)
     else:
-        seen = KnownPoses.cartesian(
+        poses = KnownPoses.cartesian(
             values["x_m"],
             values["y_m"],
             np.radians(values["heading_deg"]),
             landmark_xy_m=landmark_xy_m,
             landmark_yaw_rad=landmark_yaw_rad,
         )
-    frames = None
-    if "frames" in values:
-        frames = values["frames"].astype(np.int64)
-        for where, given, whole in zip(place, values["frames"], frames, strict=True):
-            if given != whole or whole < 1:
-                raise InputFileError(f"{where}: 'frames' must be a number of frames, got {given:g}")
-    return KnownPoses(
-        seen.distance_m,
-        seen.delta_rad,
-        seen.bearing_rad,
-        values.get("height_m", zero),
-        values.get("wall_m"),
-        frames,
-        place,
-        next((scale * values[name] for name, scale in TIMES.items() if name in values), None),
+    return replace(
+        poses,
+        height_m=values.get("height_m", poses.height_m),
+        wall_m=values.get("wall_m"),
+        frames=values["frames"].astype(np.int64) if "frames" in values else None,
+        place=tuple(where for where, _ in table),
+        time_s=next((scale * values[name] for name, scale in TIMES.items() if name in values), None),
     )
 
 
@@ -281,50 +266,3 @@ def _check_header(path: Path, names: list[str]) -> bool:
     if set(TIMES) <= set(names):
         raise InputFileError(f"{path}: columns 't_s' and 't_ms' state the same stamps twice: keep one of them")
     return own is POLAR
-
-
-def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:
-    """Assign frames to each pose.
-
-    Parameters
-    ----------
-    frames : sequence of Frames
-        What was read from each file, in order: one position a pose; or one position whose frames belong to all poses
-        in turn, `KnownPoses.frames` each or all the same number.
-    poses : KnownPoses
-        Known poses of the camera.
-
-    Returns
-    -------
-    list of Frames
-        One position each, as many as poses.
-
-    Raises
-    ------
-    UsageError
-        The numbers do not fit.
-    """
-    positions = [one[k : k + 1] for one in frames for k in range(len(one))]
-    n = len(poses)
-    if len(positions) == n:
-        if poses.frames is not None:
-            for k, (own, stated) in enumerate(zip(positions, poses.frames, strict=True)):
-                if own.n_frames != stated:
-                    raise UsageError(f"{poses.where(k)}: 'frames' says {stated}, but there are {own.n_frames}")
-        return positions
-    if len(positions) != 1:
-        raise UsageError(f"there are {n} poses, but frames of {len(positions)} positions: each pose needs its own")
-    whole = positions[0]
-    total = whole.n_frames
-    counts = poses.frames
-    if counts is None:
-        if total % n:
-            raise UsageError(
-                f"{total} frames cannot be shared among {n} poses alike: give each pose a file of its own, or a column"
-                " 'frames' with the number of each"
-            )
-        counts = np.full(n, total // n)
-    if counts.sum() != total:
-        raise UsageError(f"the poses claim {counts.sum()} frames in all, but there are {total}")
-    ends = np.cumsum(counts)
-    return [whole.some_frames(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]

@@ -1,9 +1,8 @@
 """Model of a calibration: the frames that a camera with any mounting would see from known positions.
 
-The mounting is nine numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
-half angles), two move the landmark in its image (height and bearing), one delays the light (range offset), one the time
-stamps (delay, for a moving camera), and one is the brightness of the landmark (albedo), which is not the camera's.
-Where the camera has a lens, its terms follow these nine, and both half angles follow from it.
+A lens has as many of :data:`~phasemark.render.sensor.lens_fields.TERMS` as it states. What one of them is worth depends
+on the image: the natural unit of a term moves the image point that it moves most by 1°, so that a unit of k1 means the
+same before 16 and before 640 columns, and a standard deviation in units is one of the image at its farthest.
 """
 
 from __future__ import annotations
@@ -16,202 +15,40 @@ from dataclasses import dataclass, replace
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from phasemark import UsageError
 from phasemark.matcher.calibration.known_poses import KnownPoses
-from phasemark.matcher.calibration.lens_terms import farthest_lens, lens_of, natural_units, numbers_of
+from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, Mounting, clipped, lens_of
 from phasemark.matcher.calibration.pose_track import PoseTrack
-from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
-from phasemark.render.sensor.lens_fields import LENS_FIELD, TERMS, Lens
+from phasemark.render.sensor.lens_fields import TERMS
+from phasemark.render.sensor.lens_map import distort
+from phasemark.render.sensor.lens_rates import lens_rates
 
-
-@dataclass(frozen=True)
-class Parameter:
-    """One number of a mounting.
-
-    Parameters
-    ----------
-    name : str
-        As options have it, e.g. ``pitch``.
-    attribute : str, optional
-        Of :class:`Mounting`, with its unit inside the program; None: a term of its lens.
-    scale : float
-        Its natural unit: 1°, 1 cm, a tenth of albedo; what steps and conditions are told in. That of a term of a lens
-        depends on the image, see :attr:`CalibrationModel.scale`.
-    shown : float
-        Multiplies it for people: degrees, millimetres.
-    unit : str
-        Of what is shown.
-    field : str, optional
-        Of :class:`~phasemark.render.Sensor`; None: the sensor file has no place for it.
-    """
-
-    name: str
-    attribute: str | None
-    scale: float
-    shown: float
-    unit: str
-    field: str | None
-
-
-_DEGREE, _CM = math.radians(1.0), 0.01
-PARAMETERS = {
-    parameter.name: parameter
-    for parameter in (
-        Parameter("pitch", "pitch_rad", _DEGREE, 1 / _DEGREE, "°", "pitch_deg"),
-        Parameter("roll", "roll_rad", _DEGREE, 1 / _DEGREE, "°", "roll_deg"),
-        Parameter("height", "height_m", _CM, 1e3, "mm", "height_offset_m"),
-        Parameter("bearing", "bearing_rad", _DEGREE, 1 / _DEGREE, "°", "bearing_offset_deg"),
-        Parameter("half_angle_h", "half_angle_h_rad", _DEGREE, 1 / _DEGREE, "°", "half_angle_h_deg"),
-        Parameter("half_angle_v", "half_angle_v_rad", _DEGREE, 1 / _DEGREE, "°", "half_angle_v_deg"),
-        Parameter("range_offset", "range_offset_m", _CM, 1e3, "mm", "range_offset_m"),
-        Parameter("albedo", "albedo", 0.1, 1.0, "", None),
-        Parameter("delay", "delay_s", 0.01, 1e3, "ms", "delay_s"),
-        *(
-            Parameter(name, None, 1.0, 1.0, "px" if name in ("fx", "fy", "cx", "cy") else "", LENS_FIELD + name)
-            for name in TERMS
-        ),
-    )
-}
-"""What a calibration can estimate, by name."""
-ALL_NAMES = tuple(PARAMETERS)
-"""The order of the parameter vector."""
-MOUNTING_NAMES = tuple(name for name in ALL_NAMES if name not in TERMS)
-"""All but the terms of a lens, which follow in the vector."""
-HALF_ANGLES = ("half_angle_h", "half_angle_v")
-NAMES = MOUNTING_NAMES[:-1]
-"""What frames from still poses can tell; the delay takes a moving camera."""
-SCALE = np.array([parameter.scale for parameter in PARAMETERS.values()])
-"""Natural units, in the order of :data:`ALL_NAMES`; 1 for the terms of a lens."""
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
 """Half the width of a difference, radians or metres: 1/60 of a pixel, wide enough to average what jumps where an edge
 passes a corner of a pixel, narrow enough to be the slope."""
-_LENS = np.full(len(TERMS), np.inf)
-_LEAST = np.array([-0.75, -0.75, -2.0, -1.2, 0.01, 0.01, -np.inf, 1e-3, -10.0, *-_LENS])
-_MOST = np.array([0.75, 0.75, 2.0, 1.2, 1.4, 1.4, np.inf, np.inf, 10.0, *_LENS])
-POSE = ("distance_m", "delta_rad", "bearing_rad")
+POSE = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 """What of a pose may be uncertain."""
-
-
-@dataclass(frozen=True)
-class Mounting:
-    """Parameters of a mounting, and the few of the camera itself that frames from known positions determine.
-
-    Parameters
-    ----------
-    pitch_rad, roll_rad : float
-        Tilt, PHYSICS section 2.
-    height_m : float
-        Of the landmark's origin above the lens, where a pose's own height is zero.
-    bearing_rad : float
-        Azimuth of the landmark's axis in the camera frame, where a pose's own bearing is zero.
-    half_angle_h_rad, half_angle_v_rad : float
-        Half of the field of view, horizontally and vertically, radians.
-    range_offset_m : float
-        Constant error of all ranges, metres.
-    albedo : float
-        Of the landmark.
-    delay_s : float
-        Added to the stamp of a frame to get the time at which the camera was where the frame shows it.
-    lens : Lens, optional
-        Of the camera; then both half angles follow from it. None: the ideal lens.
-    """
-
-    pitch_rad: float
-    roll_rad: float
-    height_m: float
-    bearing_rad: float
-    half_angle_h_rad: float
-    half_angle_v_rad: float
-    range_offset_m: float
-    albedo: float
-    delay_s: float = 0.0
-    lens: Lens | None = None
-
-    @classmethod
-    def of_sensor(cls, sensor: Sensor, albedo: float) -> Mounting:
-        """Read the mounting that a sensor states."""
-        return cls(
-            math.radians(sensor.pitch_deg),
-            math.radians(sensor.roll_deg),
-            sensor.height_offset_m,
-            math.radians(sensor.bearing_offset_deg),
-            math.radians(sensor.half_angle_h_deg),
-            math.radians(sensor.half_angle_v_deg),
-            sensor.range_offset_m,
-            albedo,
-            sensor.delay_s,
-            sensor.lens,
-        )
-
-    @classmethod
-    def of_vector(cls, theta: NDArray[np.float64], sensor: Sensor) -> Mounting:
-        """Take numbers in the order of :data:`ALL_NAMES`.
-
-        Parameters
-        ----------
-        theta : (21,) float64
-            The numbers in the order of the fields, metres and radians.
-        sensor : Sensor
-            Whose kind of lens the terms belong to, if it has one.
-
-        Raises
-        ------
-        UsageError
-            The terms make no lens.
-        ValueError
-            The lens folds inside the image.
-        """
-        mounting = cls(*theta[: len(MOUNTING_NAMES)].tolist())
-        if sensor.lens is None:
-            return mounting
-        lens = lens_of(sensor.lens, theta[len(MOUNTING_NAMES) :])
-        across, along = lens.before(sensor.rows, sensor.cols).tan_half_angles
-        return replace(mounting, half_angle_h_rad=math.atan(across), half_angle_v_rad=math.atan(along), lens=lens)
-
-    @property
-    def vector(self) -> NDArray[np.float64]:
-        """The numbers in the order of :data:`ALL_NAMES`, (21,); 0 for terms that no lens has."""
-        own = [getattr(self, str(PARAMETERS[name].attribute)) for name in MOUNTING_NAMES]
-        return np.concatenate([own, numbers_of(self.lens)])
-
-    def number(self, name: str) -> float:
-        """Return one of the numbers by its name."""
-        return float(self.vector[ALL_NAMES.index(name)])
-
-    def on(self, sensor: Sensor) -> Sensor:
-        """Return a sensor mounted like this; one with a lens gets that of the mounting, if it has one.
-
-        Raises
-        ------
-        UsageError
-            The lens folds inside the image, or the sensor has none.
-        """
-        if self.lens is not None and sensor.lens is None:
-            raise UsageError("a mounting with a lens belongs to a sensor with a lens, and this one has none")
-        changes: dict[str, object] = {
-            "pitch_deg": math.degrees(self.pitch_rad),
-            "roll_deg": math.degrees(self.roll_rad),
-            "bearing_offset_deg": math.degrees(self.bearing_rad),
-            "height_offset_m": self.height_m,
-            "range_offset_m": self.range_offset_m,
-            "delay_s": self.delay_s,
-        }
-        if sensor.lens is None:
-            changes["half_angle_h_deg"] = math.degrees(self.half_angle_h_rad)
-            changes["half_angle_v_deg"] = math.degrees(self.half_angle_v_rad)
-        elif self.lens is not None:
-            changes["lens"] = self.lens
-        return sensor.with_(**changes)
-
-
-def clipped(theta: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Clip a mounting to the limits of its parameters."""
-    return np.asarray(np.clip(theta, _LEAST, _MOST))
+EFFECTS = (*POSE, "time_s")
+"""Errors of a pose and of its stamp, by which slopes can be taken beside the parameters of the mounting."""
+_ALIKE = {"bearing_rad": "bearing", "height_m": "height"}
+"""Errors of a pose that move an image as a parameter does: one slope serves both, and they cancel where they should."""
+_TERM_UNIT = math.tan(math.radians(1.0))
+"""By how much, as a tangent, a natural unit of a term of the lens moves the image where it moves it most."""
+_POINTS = 9
+"""Along each side of the image."""
+_LEAST_STRETCH = 0.01
+"""A lens that leaves a smaller share of its area to a part of the image is about to fold there: no step leads to it."""
+_HALVINGS = 12
+"""How often a step that leads to no lens is halved before it is not taken."""
+_FULL = 1 - 1e-6
+"""Coverage of a pixel that sees nothing but the landmark."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +68,44 @@ class Images:
     intensity: NDArray[np.float64]
     coverage: NDArray[np.float64]
     alone: NDArray[np.complex128]
+
+
+def range_residual(evidence: Evidence, images: Images) -> NDArray[np.float64]:
+    """Return measured less modelled ranges, metres, (K, pixels); NaN where the model sees nothing."""
+    late = np.angle(evidence.value * images.phasor.conj())
+    return np.where(images.phasor != 0, evidence.sensor.metres_per_radian * late, np.nan)
+
+
+def natural_units(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the natural units of all parameters, with those of the terms of a sensor's lens, (21,)."""
+    rates = {} if sensor.lens is None else lens_rates(sensor.lens, sensor.rows, sensor.cols)
+    own = {name: _TERM_UNIT / rate for name, rate in rates.items()}
+    return np.array([own.get(name, one.scale) for name, one in PARAMETERS.items()])
+
+
+def stretch_of(sensor: Sensor, theta: NDArray[np.float64]) -> float:
+    """Return the least share of its area at the axis that a lens leaves to any part of an image; 0 if it is no lens.
+
+    A lens that folds inside the image, or is out of range, is none. Where the share is 0 it is about to fold.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        With a lens, whose model and number of coefficients are kept.
+    theta : (21,) float64
+        In the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
+    """
+    assert sensor.lens is not None
+    try:
+        lens = lens_of(sensor.lens, theta)
+        sensor.with_(lens=lens)
+    except UsageError:
+        return 0.0
+    before = lens.before(sensor.rows, sensor.cols)
+    u, v = np.meshgrid(np.linspace(0, sensor.cols, _POINTS), np.linspace(0, sensor.rows, _POINTS))
+    y, z = before.rays(u, v)
+    _, _, xx, xy, yy = distort(before.model, before.k, -y, -z)
+    return float(np.nan_to_num(xx * yy - xy * xy).min())
 
 
 class CalibrationModel:
@@ -275,25 +150,23 @@ class CalibrationModel:
         stamp_s: NDArray[np.float64] | None = None,
         one: OneFrequency | None = None,
     ) -> None:
-        self._track, self._stamp_s = track, stamp_s
-        self.scale = np.concatenate([SCALE[: len(MOUNTING_NAMES)], natural_units(sensor)])
+        self.scale = natural_units(sensor)
         """Natural units, in the order of :data:`ALL_NAMES`; those of the lens of this sensor."""
-        self.step = np.where(np.isin(ALL_NAMES, TERMS), self.scale / _DEGREE, 1.0) * STEP
+        self.step = np.where(np.isin(ALL_NAMES, TERMS), self.scale / math.radians(1.0), 1.0) * STEP
         """Half the width of a difference in each: for terms of the lens, what moves the image by :data:`STEP`."""
         self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
+        self._track, self._stamp_s = track, stamp_s
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
         self._renderer = Renderer(mesh, sensor if one is None else one.camera, albedo=albedo, harmonics=())
         if one is not None:
             self._renderer = OneFrequencyRenderer(self._renderer, one)
-        self._background = background
-        walls = poses.wall_m
-        if walls is None:
-            self._scenes = [(np.arange(len(poses)), background)]
-        else:
+        self._scenes = [(np.arange(len(poses)), background)]
+        if poses.wall_m is not None:
             base = background or Background()
             self._scenes = [
-                (np.flatnonzero(walls == wall), replace(base, wall_m=float(wall))) for wall in np.unique(walls)
+                (np.flatnonzero(poses.wall_m == wall), replace(base, wall_m=float(wall)))
+                for wall in np.unique(poses.wall_m)
             ]
 
     def mounting(self, theta: NDArray[np.float64]) -> Mounting:
@@ -312,20 +185,34 @@ class CalibrationModel:
             In the order of :data:`ALL_NAMES`; the first has a lens that does not fold.
         """
         there = clipped(theta + step)
-        n = len(MOUNTING_NAMES)
-        there[n:] = farthest_lens(self.sensor, theta[n:], there[n:])
+        lens = np.isin(ALL_NAMES, TERMS)
+        whole = there[lens] - theta[lens]
+        if self.sensor.lens is None or not whole.any():
+            return there
+        least = min(_LEAST_STRETCH, stretch_of(self.sensor, theta))
+        for halvings in range(_HALVINGS):
+            if halvings:
+                there[lens] = theta[lens] + 0.5**halvings * whole
+            if stretch_of(self.sensor, there) > least:
+                return there
+        there[lens] = theta[lens]
         return there
 
-    def beside(self, theta: NDArray[np.float64], column: int, away: float) -> NDArray[np.float64]:
-        """Return numbers with one of them moved, as far as :meth:`moved` lets it."""
-        step = np.zeros(len(theta))
-        step[column] = away
-        return self.moved(theta, step)
+    def stepped(
+        self, theta: NDArray[np.float64], columns: NDArray[np.int64], step: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return where a step of some parameters leads; see :meth:`moved`."""
+        whole = np.zeros(len(theta))
+        whole[columns] = step
+        return self.moved(theta, whole)
 
-    def span(self, theta: NDArray[np.float64], column: int, half: float) -> float:
-        """Return how far apart the ends of a difference are: less than twice its half width next to a fold."""
-        ends = [float(self.beside(theta, column, side * half)[column]) for side in (1.0, -1.0)]
-        return ends[0] - ends[1] or 2 * half
+    def beside(
+        self, theta: NDArray[np.float64], column: int, half: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Return both ends of a difference by one number and how far they are apart: less where a step is cut."""
+        step = half * np.eye(len(theta))[column]
+        high, low = self.moved(theta, step), self.moved(theta, -step)
+        return high, low, float(high[column] - low[column]) or 2 * half
 
     @property
     def has_background(self) -> bool:
@@ -350,7 +237,7 @@ class CalibrationModel:
         ------
         UsageError
         """
-        views = self._views(theta, np.zeros((len(self.poses), 3))).in_camera(self.mounting(theta).on(self.sensor))
+        views = self._views(theta, None).in_camera(self.mounting(theta).on(self.sensor))
         views = replace(views, distance_m=views.distance_m - slack_m, height_m=views.height_m + slack_m)
         for which, background in self._scenes:
             if background is not None:
@@ -363,15 +250,17 @@ class CalibrationModel:
         lens = -distance * np.column_stack([np.cos(delta), np.sin(delta)])
         return np.asarray(((lens > vertices.min(axis=0)) & (lens < vertices.max(axis=0))).all(axis=1))
 
-    def images(self, theta: NDArray[np.float64], shift: NDArray[np.float64], *, need_alone: bool = False) -> Images:
+    def images(
+        self, theta: NDArray[np.float64], shift: NDArray[np.float64] | None = None, *, need_alone: bool = False
+    ) -> Images:
         """Render all poses.
 
         Parameters
         ----------
         theta : (21,) float64
             The mounting.
-        shift : (K, 3) or (K, 4) float64
-            What is added to the poses, :data:`POSE` and the height.
+        shift : (K, 4) or (K, 3) float64, optional
+            What is added to the poses, :data:`POSE` or the first three of them.
         need_alone : bool
             Whether the landmark alone is wanted even where nothing else is made of it.
         """
@@ -395,13 +284,12 @@ class CalibrationModel:
     def slopes(
         self,
         theta: NDArray[np.float64],
-        shift: NDArray[np.float64],
-        free: Sequence[str],
+        names: Sequence[str],
         on: ResidualKind,
         *,
-        of_poses: bool = False,
+        shift: NDArray[np.float64] | None = None,
         width: NDArray[np.float64] | None = None,
-    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    ) -> NDArray[np.complex128]:
         """Return how the images change, by central differences.
 
         On ranges the difference is one of phases, not of phasors: a pixel that an edge is just leaving has hardly any
@@ -411,71 +299,68 @@ class CalibrationModel:
         ----------
         theta, shift
             As for :meth:`images`.
-        free : sequence of str
-            Parameters.
+        names : sequence of str
+            Parameters of the mounting, and of :data:`EFFECTS` errors of the poses.
         on : {"ranges", "phasors"}
-        of_poses : bool
-            Whether the poses are uncertain too.
         width : (21,) float64, optional
             Half width of each difference; at least :attr:`step`.
 
         Returns
         -------
-        (K, p, pixels) complex128
-            Change of the phasor by each of `free`; on ranges that of its logarithm, i times the phase, 0 where nothing
+        (K, n, pixels) complex128
+            Change of the phasor by each of `names`; on ranges that of its logarithm, i times the phase, 0 where nothing
             is seen at either end.
-        (K, 3, pixels) complex128
-            By :data:`POSE`; (K, 0, pixels) without `of_poses`.
         """
         half = self.step if width is None else np.maximum(width, self.step)
+        own = {name: _ALIKE[name] if _ALIKE.get(name) in names else name for name in POSE}
 
-        def moved(name: str | None, column: int, side: float) -> NDArray[np.complex128]:
-            there, shifted = theta.copy(), shift.copy()
-            if name is None:
-                shifted[:, column] += side * STEP
-            elif name in TERMS:
-                there = self.beside(theta, column, side * half[column])
+        def difference(name: str) -> NDArray[np.complex128]:
+            if name in POSE:
+                step, span = STEP * np.eye(len(POSE))[POSE.index(name)], 2 * STEP
+                base = np.zeros((len(self.poses), len(POSE)))
+                if shift is not None:
+                    base[:, : shift.shape[1]] = shift
+                high, low = self.images(theta, base + step).phasor, self.images(theta, base - step).phasor
             else:
-                there[column] += side * half[column]
-            return self.images(there, shifted).phasor
-
-        def difference(job: tuple[str | None, int]) -> NDArray[np.complex128]:
-            name, column = job
-            span = 2 * (STEP if name is None else half[column])
-            if name in TERMS:
-                span = self.span(theta, column, half[column])
-            high, low = moved(name, column, 1.0), moved(name, column, -1.0)
+                column = ALL_NAMES.index(name)
+                there, back, span = self.beside(theta, column, half[column])
+                high, low = self.images(there, shift).phasor, self.images(back, shift).phasor
             if on == "phasors":
                 return np.asarray((high - low) / span)
             return np.asarray(1j * np.angle(high * low.conj()) / span)
 
-        rendered = [name for name in free if name != "range_offset" and (name != "albedo" or on == "ranges")]
-        columns = [] if not of_poses else [0, 1] if "bearing" in rendered else [0, 1, 2]
-        jobs: list[tuple[str | None, int]] = [(name, ALL_NAMES.index(name)) for name in rendered]
-        jobs += [(None, column) for column in columns]
+        by_time = {"delay", "time_s"} & set(names)
+        exact = {"range_offset", *by_time, *(("albedo",) if on == "phasors" else ())}
+        wanted = dict.fromkeys(own.get(name, name) for name in (*names, *(POSE if by_time else ())))
+        rendered = [name for name in wanted if name not in exact]
         with ThreadPoolExecutor(self.workers) as pool:
-            found = list(pool.map(difference, jobs))
-        by_name = dict(zip(rendered, found, strict=False))
-        by_pose = found[len(rendered) :]
-        if of_poses and "bearing" in rendered:
-            by_pose.append(by_name["bearing"])
-        if set(free) - set(rendered):
-            image = self.images(theta, shift, need_alone=on == "phasors" and "albedo" in free)
-            later = 1.0 if on == "ranges" else image.phasor
-            by_name["range_offset"] = np.broadcast_to(1j * later / self.sensor.metres_per_radian, image.phasor.shape)
-            by_name.setdefault("albedo", image.alone / theta[ALL_NAMES.index("albedo")])
-        k, pixels = len(self.poses), self.sensor.rows * self.sensor.cols
-        empty = np.zeros((k, 0, pixels), np.complex128)
-        return (
-            np.stack([by_name[name] for name in free], axis=1) if free else empty,
-            np.stack(by_pose, axis=1) if of_poses else empty,
-        )
+            found = dict(zip(rendered, pool.map(difference, rendered), strict=True))
+        found |= {name: found[same] for name, same in own.items() if same in found}
+        if by_time:
+            moving = np.einsum("ks,skr->kr", self.poses_at(theta)[1], np.stack([found[name] for name in POSE]))
+            found |= dict.fromkeys(by_time, moving)
+        if on == "ranges":
+            found["range_offset"] = np.full(
+                (len(self.poses), self.sensor.rows * self.sensor.cols), 1j / self.sensor.metres_per_radian
+            )
+        elif exact & set(names):
+            image = self.images(theta, shift, need_alone="albedo" in names)
+            found["range_offset"] = 1j * image.phasor / self.sensor.metres_per_radian
+            found["albedo"] = image.alone / theta[ALL_NAMES.index("albedo")]
+        return np.stack([found[name] for name in names], axis=1)
 
     def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the share of each pixel that sees the landmark, (K, pixels)."""
-        mounting = self.mounting(theta)
-        views = self._views(theta, np.zeros((len(self.poses), 3)))
-        return self._render(mounting, views, alone=True).coverage.reshape(len(views), -1)
+        views = self._views(theta, None)
+        return self._render(self.mounting(theta), views, alone=True).coverage.reshape(len(views), -1)
+
+    def alone(self, images: Images, *, from_edges: bool = False) -> NDArray[np.bool_]:
+        """Return which pixels see nothing but the landmark, (K, pixels), or also a pixel away from its edges."""
+        full = images.coverage > _FULL
+        if not from_edges:
+            return np.asarray(full)
+        shaped = full.reshape(-1, self.sensor.rows, self.sensor.cols)
+        return np.asarray(ndimage.minimum_filter(shaped, size=(1, 3, 3), mode="nearest").reshape(full.shape))
 
     def _turn(self, mounting: Mounting, image: PhasorImages) -> NDArray[np.complex128]:
         """Return the factor from rendered phasors to those measured by the camera, (1 or K, rows, cols).
@@ -489,19 +374,17 @@ class CalibrationModel:
         longer = image.sensor.axis_cosine() / self._axis_cosine - 1
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
 
-    def pose_rates(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rates of distance, δ, bearing and height at the frames' times, (K, 4) per second; 0 if still."""
-        if self._track is None or self._stamp_s is None:
-            return np.zeros((len(self.poses), 4))
-        return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])[1]
-
-    def _views(self, theta: NDArray[np.float64], shift: NDArray[np.float64]) -> Views:
-        poses = self.poses
-        seen = np.column_stack([poses.distance_m, poses.delta_rad, poses.bearing_rad, poses.height_m])
+    def poses_at(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return :data:`POSE` of each frame and their rates per second, (K, 4) each; the rates are 0 at rest."""
         if self._track is not None and self._stamp_s is not None:
-            seen = self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])[0]
-        seen = seen.copy()
-        seen[:, : shift.shape[1]] += shift
+            return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])
+        still = np.column_stack([getattr(self.poses, name) for name in POSE])
+        return still, np.zeros_like(still)
+
+    def _views(self, theta: NDArray[np.float64], shift: NDArray[np.float64] | None) -> Views:
+        seen = self.poses_at(theta)[0]
+        if shift is not None:
+            seen[:, : shift.shape[1]] += shift
         return Views(*np.ascontiguousarray(seen.T))
 
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:

@@ -8,27 +8,11 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibration.known_poses import KnownPoses
-from phasemark.matcher.calibration.mounting_model import PARAMETERS
+from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
+from phasemark.matcher.calibration.mounting import PARAMETERS, named
 from phasemark.render.integral.rounding import error_text
 from phasemark.render.sensor.lens_fields import TERMS
 
-TITLES = {
-    "pitch": "pitch",
-    "roll": "roll",
-    "height": "height",
-    "bearing": "bearing",
-    "half_angle_h": "horizontal field of view",
-    "half_angle_v": "vertical field of view",
-    "range_offset": "range offset",
-    "albedo": "albedo",
-    "delay": "delay",
-    "fx": "focal length fx",
-    "fy": "focal length fy",
-    "cx": "principal point cx",
-    "cy": "principal point cy",
-    **{name: f"distortion {name}" for name in TERMS[4:]},
-}
 _POORLY = 0.5
 """Natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known."""
 _WELL = 0.05
@@ -45,12 +29,6 @@ _ALIKE_AT_ONE_DISTANCE = (("pitch", "height"), ("range_offset", "half_angle_h", 
 """What looks the same at one distance but for what landmark and light are known to be."""
 _BY_DISTANCE = {"pitch", "height", "range_offset", "half_angle_h", "half_angle_v", "fx", "fy"}
 _BY_BEARING = {"roll", "bearing", "half_angle_h", "fx"}
-
-
-def named(names: Sequence[str]) -> str:
-    """Put names of parameters into a list in words."""
-    titles = [TITLES[name] for name in names]
-    return titles[0] if len(titles) == 1 else f"{', '.join(titles[:-1])} and {titles[-1]}"
 
 
 def advice(names: Sequence[str], poses: KnownPoses) -> str:
@@ -104,7 +82,7 @@ def observability_notes(
         value = f"± {error}{' ' if parameter.unit in ('mm', 'px') else ''}{parameter.unit}"
         others = [b if a == name else a for a, b, _ in pairs if name in (a, b)]
         trades = f", for it trades with the {named(others)}" if others else ""
-        notes.append(f"The {TITLES[name]} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")
+        notes.append(f"The {parameter.title} is poorly known, {value}{trades}: {advice([name, *others], poses)}.")
     told = {name for pair in pairs for name in pair[:2]} | set(poor)
     alike = poses.distance_m.max() < _ALIKE * poses.distance_m.min()
     if alike:
@@ -119,28 +97,102 @@ def observability_notes(
     for a, b, rho in pairs:
         if a not in poor and b not in poor and (alike or not {a, b} <= well):
             notes.append(
-                f"The {TITLES[a]} and the {TITLES[b]} trade for one another (correlation {rho:.3f}):"
-                f" {advice([a, b], poses)}."
+                f"The {PARAMETERS[a].title} and the {PARAMETERS[b].title} trade for one another (correlation"
+                f" {rho:.3f}): {advice([a, b], poses)}."
             )
     return notes
 
 
-def odd_pose_notes(poses: KnownPoses, chi2_share: NDArray[np.float64]) -> list[str]:
-    """Name the poses that fit far worse than the others.
+def pose_std_note(estimated: PoseStd) -> str:
+    """Say which errors of the poses were found from the residuals."""
+    return (
+        "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
+        f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
+        f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with pose_std=…)."
+    )
+
+
+def misfit_notes(excess: float, p_value: float, poses: KnownPoses, chi2_share: NDArray[np.float64]) -> list[str]:
+    """Say that the model does not fit, and name the poses that fit far worse than the others.
 
     Parameters
     ----------
+    excess : float
+        χ² over what noise leaves.
+    p_value : float
     poses : KnownPoses
     chi2_share : (K,) float64
         χ² of each over its residuals; 0 where it has none.
     """
+    notes = [
+        f"The model does not fit: χ² is {excess:.3g} times what noise leaves (p = {p_value:.2g}): are landmark,"
+        " background and units right, and are the poses as exact as stated?"
+    ]
     told = chi2_share[chi2_share > 0]
-    if not told.size:
-        return []
-    limit = _WRONG_POSE * max(float(np.median(told)), 1.0)
+    limit = _WRONG_POSE * max(float(np.median(told)), 1.0) if told.size else math.inf
     odd = [int(k) for k in np.argsort(-chi2_share) if chi2_share[k] > limit]
-    if not odd or len(odd) > len(poses) / 2:
+    if odd and len(odd) <= len(poses) / 2:
+        shown = "; ".join(f"{poses.where(k)} (χ² a residual: {chi2_share[k]:.3g})" for k in odd[:_MOST_NAMED])
+        more = f" and {len(odd) - _MOST_NAMED} more" if len(odd) > _MOST_NAMED else ""
+        notes.append(f"Some poses fit far worse than the others; were they measured and recorded right? {shown}{more}.")
+    return notes
+
+
+def unused_notes(edges: bool, poses: KnownPoses, count: NDArray[np.int64]) -> list[str]:
+    """Note that edges of the landmark were left out, and poses of which no pixel counts.
+
+    Parameters
+    ----------
+    edges : bool
+        Whether they count.
+    poses : KnownPoses
+    count : (K,) int64
+        Residuals of each pose.
+    """
+    notes = []
+    if not edges:
+        notes.append(
+            "Something returns beside the landmark and no background=… or wall_m says what: pixels at the landmark's"
+            " edges were left out, which tell most."
+        )
+    unseen = np.flatnonzero(count == 0)
+    if unseen.size:
+        where = poses.where(int(unseen[0]))
+        notes.append(f"{unseen.size} of {len(poses)} poses tell nothing: no pixel counts, first at {where}.")
+    return notes
+
+
+def untold_notes(untold: Sequence[str]) -> list[str]:
+    """Note which parameters a recording leaves as they were assumed."""
+    if not untold:
         return []
-    shown = "; ".join(f"{poses.where(k)} (χ² a residual: {chi2_share[k]:.3g})" for k in odd[:_MOST_NAMED])
-    more = f" and {len(odd) - _MOST_NAMED} more" if len(odd) > _MOST_NAMED else ""
-    return [f"Some poses fit far worse than the others; were they measured and recorded right? {shown}{more}."]
+    return [
+        f"The {named(untold)} {'are' if len(untold) > 1 else 'is'} not told by these frames and as assumed, within"
+        " the standard deviations shown."
+    ]
+
+
+def recording_notes(use: NDArray[np.bool_], left_out: float, systematic: NDArray[np.float64]) -> list[str]:
+    """Note how many pixels disagreed, and which errors noise does not explain.
+
+    Parameters
+    ----------
+    use : (K, pixels) bool
+    left_out : float
+        Share of the pixels that disagreed.
+    systematic : (5,) float64
+        Standard deviations of pose errors: distance, δ, bearing, height, time.
+    """
+    notes = [
+        f"{int(use.sum())} pixels of {int(use.any(axis=1).sum())} frames counted; {100 * left_out:.1f} % of those that"
+        " should see the landmark disagreed with it and were left out."
+    ]
+    texts = ("{:.2g} mm in distance", "{:.2g}° in δ", "{:.2g}° in bearing", "{:.2g} mm in height", "{:.2g} ms in time")
+    shown = systematic * [1e3, math.degrees(1), math.degrees(1), 1e3, 1e3]
+    parts = [text.format(size) for text, size in zip(texts, shown, strict=True) if size > 0]
+    if parts:
+        notes.append(
+            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations): systematic errors"
+            " of the sensor file."
+        )
+    return notes

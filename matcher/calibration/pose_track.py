@@ -8,7 +8,7 @@ joined by cubic Hermite splines.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,11 +40,14 @@ class PoseTrack:
         Number of poses left out because their stamp repeats or runs backwards.
     jitter_s : float
         How far stamps are at least uncertain, standard deviation: 0 where none repeats.
+    sign : (4,) float64
+        Factors of the splines.
     """
 
     pieces: tuple[tuple[float, float, interpolate.CubicHermiteSpline], ...]
     dropped: int
     jitter_s: float = 0.0
+    sign: NDArray[np.float64] = field(default_factory=lambda: np.ones(4))
 
     @classmethod
     def of(cls, poses: KnownPoses) -> PoseTrack:
@@ -68,10 +71,8 @@ class PoseTrack:
             [poses.distance_m, np.unwrap(poses.delta_rad), np.unwrap(poses.bearing_rad), poses.height_m]
         )[first]
         ends = np.flatnonzero(np.diff(time) > LONGEST_GAP_S) + 1
-        pieces = []
-        for part in np.split(np.arange(len(time)), ends):
-            if len(part) >= _FEWEST:
-                pieces.append(_smooth(time[part], values[part]))
+        parts = np.split(np.arange(len(time)), ends)
+        pieces = [_smooth(time[part], values[part]) for part in parts if len(part) >= _FEWEST]
         if not pieces:
             raise UsageError(
                 f"no {_FEWEST} poses follow one another within {LONGEST_GAP_S:g} s each: are their stamps in the unit"
@@ -81,14 +82,7 @@ class PoseTrack:
 
     def mirrored(self) -> PoseTrack:
         """Return the track with the other sign of δ and bearing."""
-        sign = np.array([1.0, -1.0, -1.0, 1.0])
-
-        def turned(spline: interpolate.CubicHermiteSpline) -> interpolate.CubicHermiteSpline:
-            return interpolate.CubicHermiteSpline(spline.x, spline(spline.x) * sign, spline(spline.x, 1) * sign)
-
-        return PoseTrack(
-            tuple((start, end, turned(spline)) for start, end, spline in self.pieces), self.dropped, self.jitter_s
-        )
+        return replace(self, sign=self.sign * np.array([1.0, -1.0, -1.0, 1.0]))
 
     def known(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return True where a stretch of time lies between two gaps, (n,)."""
@@ -119,7 +113,7 @@ class PoseTrack:
                 inside = np.clip(time_s[own], start, end)
                 value[own] = spline(inside)
                 rate[own] = np.where((inside == time_s[own])[:, None], spline(inside, 1), 0.0)
-        return value, rate
+        return self.sign * value, self.sign * rate
 
 
 def _smooth(

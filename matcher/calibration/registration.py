@@ -7,20 +7,22 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.calibration.mounting_model import ALL_NAMES, LONGEST_STEP, CalibrationModel, clipped
+from phasemark.matcher.calibration.mounting import HALF_ANGLES, columns_of
+from phasemark.matcher.calibration.mounting_model import LONGEST_STEP, CalibrationModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render.sensor.lens_fields import TERMS
 
-OUTLINE = ("pitch", "roll", "height", "bearing", "half_angle_h", "half_angle_v", *TERMS)
+_PLACES = ("pitch", "roll", "height", "bearing")
+OUTLINE = (*_PLACES, *HALF_ANGLES, *TERMS)
 """What an outline tells."""
-_OUTLINE_STD = np.array([3.0, 3.0, 3.0, 3.0, *[0.7] * (len(OUTLINE) - 4)])
+_PLACE_STD, _OTHER_STD = 3.0, 0.7
 """Standard deviation of each about its initial guess, in natural units; the registration alone uses it."""
 _OUTLINE_NOISE = 0.2
 """Of a pixel: how much of it the model says returns, against whether it did."""
 _RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
 """Coverage that is enough for a return, and for one from the landmark if something stands behind; below, the chance of
 it is taken to rise evenly."""
-_TRIED = np.array([-3.0, -1.5, 0.0, 1.5, 3.0])
+_TRIED = (-3.0, -1.5, 0.0, 1.5, 3.0)
 """Pitches and bearings, degrees, from which the registration may start: a pixel apart."""
 _BESIDE = 0.02
 """Share of pixels with a return from elsewhere, above which something stands behind."""
@@ -62,44 +64,36 @@ def register(
     if not (known & ~seen.returned).any() and (target[known] == 1).all():
         known = np.ones_like(known)  # nothing was distinguished: a missing pixel returned nothing
     enough = _PREVAILS_FROM if (seen.returned & ~near).mean() > _BESIDE else _RETURNS_FROM
-    columns = np.array([ALL_NAMES.index(name) for name in free])
+    columns = columns_of(free)
     scale = model.scale[columns]
-    prior = np.array([_OUTLINE_STD[OUTLINE.index(name)] for name in free])
+    prior = np.where(np.isin(free, _PLACES), _PLACE_STD, _OTHER_STD)
 
     def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
         returns = np.minimum(model.coverage(at) / enough, 1.0)
-        return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE)
+        return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE).ravel()
 
     def cost(at: NDArray[np.float64]) -> float:
         away = (at - theta)[columns] / scale / prior
         return float((difference(at) ** 2).sum() + (away**2).sum())
 
     def slope(at: NDArray[np.float64], column: int) -> NDArray[np.float64]:
-        move = np.eye(len(ALL_NAMES))[column] * model.scale[column] * _OUTLINE_WIDTH
-        if ALL_NAMES[column] not in TERMS:
-            return np.asarray((difference(at - move) - difference(at + move)).ravel() / (2 * _OUTLINE_WIDTH))
-        low, high = model.moved(at, -move), model.moved(at, move)
-        span = model.span(at, column, float(move[column])) / model.scale[column]
-        return np.asarray((difference(low) - difference(high)).ravel() / span)
+        unit = model.scale[column]
+        high, low, span = model.beside(at, column, unit * _OUTLINE_WIDTH)
+        return np.asarray((difference(low) - difference(high)) / (span / unit))
 
     tried = [theta]
     for name in ("pitch", "bearing"):
         if name in free:
-            steps = np.eye(len(ALL_NAMES))[ALL_NAMES.index(name)] * model.scale[ALL_NAMES.index(name)]
-            tried = [clipped(one + side * steps) for one in tried for side in _TRIED]
+            own = columns_of([name])
+            tried = [model.stepped(one, own, side * model.scale[own]) for one in tried for side in _TRIED]
     best = min(tried, key=cost)
     for _ in range(_OUTLINE_STEPS):
-        rows = []
-        for column in columns:
-            rows.append(slope(best, column))
-        design = np.array(rows)
+        design = np.array([slope(best, column) for column in columns])
         away = (best - theta)[columns] / scale
         matrix = design @ design.T + np.diag(1 / prior**2)
-        step = np.linalg.solve(matrix, design @ difference(best).ravel() - away / prior**2)
+        step = np.linalg.solve(matrix, design @ difference(best) - away / prior**2)
         step /= max(1.0, float(np.abs(step).max()) / LONGEST_STEP)
-        whole = np.zeros(len(ALL_NAMES))
-        whole[columns] = scale * step
-        moved = model.moved(best, whole)
+        moved = model.stepped(best, columns, scale * step)
         if cost(moved) >= cost(best):
             break
         best = moved

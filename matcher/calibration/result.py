@@ -3,40 +3,40 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
-from phasemark.matcher.calibration.mounting_model import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
+from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
+from phasemark.matcher.calibration.problem import Fitted, Solution, rms
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Sensor
 from phasemark.render.integral.rounding import error_text, value_and_error, with_error
-from phasemark.render.sensor.lens_fields import TERMS
-from phasemark.render.sensor.sensor_file import sensor_toml
+from phasemark.render.sensor.lens_fields import DERIVED, TERMS
+from phasemark.render.sensor.sensor_file import rounded, sensor_toml
 
 USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
 """Where the numbers go that a sensor file has no place for."""
+_NOISE, _UNEXPLAINED = "calibrated: noise law of the residuals", "calibrated: what noise does not explain"
 _COMMON = {
-    "range_std_m": "calibrated: noise law of the residuals",
-    "range_shot_std_m": "calibrated: noise law of the residuals",
-    "range_ambient_std_m": "calibrated: noise law of the residuals",
+    **dict.fromkeys(("range_std_m", "range_shot_std_m", "range_ambient_std_m"), _NOISE),
     "zone_offset_m": "calibrated",
     "calibration_fields": "what was estimated",
     "calibration_covariance": "its covariance, in the units of the fields",
-    "systematic_distance_m": "calibrated: what noise does not explain",
-    "systematic_delta_deg": "calibrated: what noise does not explain",
-    "systematic_bearing_deg": "calibrated: what noise does not explain",
-    "systematic_height_m": "calibrated: what noise does not explain",
+    **dict.fromkeys(("systematic_distance_m", "systematic_delta_deg", "systematic_bearing_deg"), _UNEXPLAINED),
+    "systematic_height_m": _UNEXPLAINED,
     "systematic_time_s": "calibrated: jitter of the stamps",
 }
 """What stands behind the fields that no parameter of the mounting has."""
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Calibration(Fitted):
     """Mounting of a camera with its covariance.
 
     Parameters
@@ -91,24 +91,11 @@ class Calibration:
     mounting: Mounting
     assumed: Mounting
     free: tuple[str, ...]
-    covariance: NDArray[np.float64]
-    covariance_from: str
-    chi2: float
-    dof: int
-    p_value: float
     on: ResidualKind
     poses: KnownPoses
-    pose_shift: NDArray[np.float64]
-    pose_chi2: NDArray[np.float64]
     pose_residuals: NDArray[np.int64]
-    residual_m: NDArray[np.float64]
-    residual_before_m: NDArray[np.float64]
-    range_std_m: NDArray[np.float64]
-    notes: tuple[str, ...]
     doubts: tuple[str, ...] = ()
     cause: str = ""
-    held_out_m: tuple[float, float] = (math.nan, math.nan)
-    left_out: float = 0.0
 
     def value(self, name: str) -> float:
         """Return one number of the mounting, radians, metres, pixels or albedo."""
@@ -162,7 +149,10 @@ class Calibration:
             "left_out": self.left_out,
             "doubts": list(self.doubts),
             "likely_cause": self.cause or None,
-            "residual_rms_mm": {"before": _rms_mm(self.residual_before_m), "after": _rms_mm(self.residual_m)},
+            "residual_rms_mm": {
+                name: _mm(rms(residual[np.isfinite(residual)]))
+                for name, residual in (("before", self.residual_before_m), ("after", self.residual_m))
+            },
             "poses": [
                 {
                     "distance_m": float(self.poses.distance_m[k]),
@@ -190,7 +180,7 @@ class Calibration:
         distortion = []
         for name in self.free:
             parameter = PARAMETERS[name]
-            error = error_text(_file_std(self, name))
+            error = error_text(self.std(name) * parameter.in_file)
             if name in TERMS[4:]:
                 distortion.append(f"{name} ± {error}")
             elif parameter.field is not None:
@@ -245,12 +235,56 @@ def _mm(value_m: float) -> float | None:
     return 1e3 * value_m if math.isfinite(value_m) else None
 
 
-def _rms_mm(residual_m: NDArray[np.float64]) -> float | None:
-    values = residual_m[np.isfinite(residual_m)]
-    return 1e3 * math.sqrt(float((values**2).mean())) if values.size else None
+def concluded(solution: Solution, doubts: tuple[str, ...], cause: str) -> Calibration:
+    """Return the calibration that a solution means, with the sensor that it makes."""
+    problem, use = solution.problem, solution.use
+    sensor, one, names = problem.sensor, problem.one, problem.names
+    mounting = Mounting.of_vector(solution.theta, sensor)
+    calibrated = _calibrated(sensor, mounting, names, solution.covariance).with_(**solution.sensor_fields)
+    shared = {each.name: getattr(solution, each.name) for each in fields(Fitted)}
+    if mounting.albedo > 1 and "albedo" in names:
+        shared["notes"] += (
+            f"An albedo of {mounting.albedo:.3g} cannot be: signal_e of the sensor is too low, or the amplitudes are"
+            " not in electrons. Only their product was measured.",
+        )
+    return Calibration(
+        sensor=calibrated if one is None else one.camera_like(calibrated),
+        base=sensor if one is None else one.camera,
+        mounting=mounting,
+        assumed=problem.assumed,
+        free=names,
+        on=problem.on,
+        poses=problem.poses_with(mounting.delay_s),
+        pose_residuals=use.sum(axis=1) * (1 if problem.on == "ranges" else 2),
+        doubts=doubts,
+        cause=cause,
+        **shared,
+    )
 
 
-def _file_std(found: Calibration, name: str) -> float:
-    """Return a standard deviation in the unit of the sensor's field: degrees or metres."""
-    parameter = PARAMETERS[name]
-    return found.std(name) * (parameter.shown if parameter.unit == "°" else 1.0)
+def _calibrated(sensor: Sensor, mounting: Mounting, free: Sequence[str], covariance: NDArray[np.float64]) -> Sensor:
+    """Return a sensor with the numbers that were estimated or restated, to the digits of a file, and their covariance.
+
+    What an earlier calibration estimated and this one left stays, uncorrelated with the rest; not half angles beside
+    terms of a lens, from which they follow.
+    """
+    there, before = mounting.on(sensor), Mounting.of_sensor(sensor, mounting.albedo)
+    changed = [
+        one.field
+        for name, one in PARAMETERS.items()
+        if one.field is not None
+        and (sensor.lens is None or name not in HALF_ANGLES)
+        and (name in free or mounting.number(name) != before.number(name))
+    ]
+    index = [k for k, name in enumerate(free) if PARAMETERS[name].field is not None]
+    own_fields = [str(PARAMETERS[free[k]].field) for k in index]
+    unit = np.array([PARAMETERS[free[k]].in_file for k in index])
+    own = covariance[np.ix_(index, index)] * np.outer(unit, unit)
+    replaced = {*own_fields, *(DERIVED if set(free) & set(TERMS) else ())}
+    older = [k for k, name in enumerate(sensor.calibration_fields) if name not in replaced]
+    kept = sensor.calibration_matrix[np.ix_(older, older)]
+    whole = linalg.block_diag((own + own.T) / 2, kept) if older else (own + own.T) / 2
+    return sensor.with_numbers({field: rounded(there.number(field)) for field in changed}).with_(
+        calibration_fields=(*own_fields, *(sensor.calibration_fields[k] for k in older)),
+        calibration_covariance=rounded(tuple(tuple(row) for row in whole.tolist())),
+    )

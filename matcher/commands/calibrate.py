@@ -35,8 +35,8 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.matcher import FilteredFrames
+    from phasemark.matcher.calibration import Mounting
     from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
-    from phasemark.matcher.calibration.mounting_model import Mounting
     from phasemark.matcher.calibration.result import Calibration
     from phasemark.render import Frames, Sensor
 
@@ -181,8 +181,7 @@ def _filtered(
 ) -> FilteredFrames:
     """Return the frames of a moving camera one by one, and those of a still one averaged at each pose."""
     from phasemark.matcher import kalman_filter
-    from phasemark.matcher.calibration.calibration import filter_poses
-    from phasemark.matcher.calibration.known_poses import frames_of_poses
+    from phasemark.matcher.calibration import filter_poses, frames_of_poses
 
     if not moving:
         return filter_poses(frames_of_poses(measured, known), on)
@@ -210,7 +209,7 @@ def _start(
     delay_ms: float | None,
 ) -> Mounting:
     """Return the initial guess of the mounting, with the albedo that was stated or that of the mesh."""
-    from phasemark.matcher.calibration.mounting_model import Mounting
+    from phasemark.matcher.calibration import Mounting
 
     albedo = float(mesh.metadata.get("albedo", 0.8)) if stated is None else stated
     if not 0 < albedo <= 1:
@@ -260,7 +259,7 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
-    from phasemark.matcher.calibration.mounting_model import PARAMETERS
+    from phasemark.matcher.calibration.mounting import PARAMETERS
     from phasemark.matcher.calibration.result import USES, shown, shown_names, shown_std
 
     rows = []

@@ -1,8 +1,9 @@
-"""The most likely mounting: registration of outlines to start with, then Levenberg–Marquardt on ranges or phasors.
+"""The most likely mounting of a camera at rest: outlines to start with, then Levenberg–Marquardt on ranges or phasors.
 
 Residuals are those of :mod:`phasemark.matcher.likelihood.residuals`, all poses together. Where poses are uncertain,
 three numbers a pose are estimated beside the mounting, each with its own standard deviation as a prior, and eliminated
-pose by pose (Schur complement), so that their cost is linear in the number of poses.
+pose by pose (Schur complement), so that their cost is linear in the number of poses. Errors of the poses are
+independent from pose to pose, normal, and of three sizes: places of the lens, headings, sides δ.
 
 Which pixels count is decided at the start and held while the mounting moves, so that the sum stays comparable; at the
 solution it is decided once more, and the mounting moves again.
@@ -16,23 +17,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import optimize
 
-from phasemark.matcher.calibration.mounting_model import (
-    ALL_NAMES,
-    LONGEST_STEP,
-    CalibrationModel,
-    Images,
-)
+from phasemark.matcher.calibration import notes as sentences
+from phasemark.matcher.calibration.checks import check_observable, check_pixels, check_poses, check_view, returns_beside
+from phasemark.matcher.calibration.known_poses import PoseStd
+from phasemark.matcher.calibration.mounting import ALL_NAMES, columns_of
+from phasemark.matcher.calibration.mounting_model import LONGEST_STEP, POSE, CalibrationModel, Images, range_residual
+from phasemark.matcher.calibration.problem import FEWEST_POSES, Problem, Solution, in_image, rms
 from phasemark.matcher.calibration.registration import OUTLINE, register
+from phasemark.matcher.chi_squared import p_values_of
+from phasemark.matcher.estimate.variances import RandomEffects
+from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.render import predicted_range_std
+from phasemark.render.sensor.sensor_file import rounded
 
 _CLEAR = 1.5
 """Phasors count where the noise of one frame is below its limit by this factor: nearer to the limit a frame's own noise
@@ -40,8 +45,6 @@ decides whether its pixel is valid, and the brighter half would stand for all.""
 _STEADY, _ORDINARY = 2.0, 1.5
 """Ranges count where the measured noise of one frame is below its limit by the first factor or, within it, at most the
 second times the median of its pose: fainter pixels see little of the landmark, and their ranges jump as it moves."""
-_FULL = 1 - 1e-6
-"""Coverage of a pixel that sees nothing but the landmark."""
 _MAX_ITERATIONS, _FOLLOWED = 40, 8
 """How often slopes are taken, and how many steps are tried with each."""
 _SETTLED = 1e-3
@@ -58,6 +61,115 @@ _WIDTHS = (0.5, 1.0, 2.0)
 """Standard deviations over which slopes are taken for the covariance."""
 _SEARCHES, _GAINED = 4, 0.1
 """How often the search is repeated about what it found, unless it saved less."""
+FALSE_ALARM = 0.01
+"""A fit whose χ² is exceeded with less than this probability does not fit."""
+_MINIMA_COST = 50.0
+"""χ² that ending in a small minimum may cost; what fits worse has other reasons."""
+_POSES_FOR_ERRORS, _ROUNDS = 6, 2
+"""Fewer poses do not tell the size of their errors; how often these sizes and the mounting are estimated in turn."""
+_POSES_FOR_SANDWICH = 3
+"""Poses for each free parameter from which their own scatter tells the covariance."""
+_STD_STARTS = np.log([2e-4, math.radians(0.02), math.radians(0.02)]) + np.array([[0.0], [2.0], [4.0]])
+"""Logarithms of the sizes of the poses' errors, metres and radians, where three descents begin."""
+_STD_BOUNDS = np.log([(1e-6, 0.1), (1e-6, math.radians(10.0)), (1e-6, math.radians(10.0))])
+"""Nothing is measured better, and nobody would call worse a known pose."""
+
+
+def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
+    """Find the most likely mounting of a camera that stood still at each pose.
+
+    Parameters
+    ----------
+    problem : Problem
+    pose_std : PoseStd, optional
+        How well the poses are known. None: they are exact, unless the residuals say that they are not.
+    """
+    check_poses(problem)
+    frames, poses, model = problem.frames, problem.poses, problem.model()
+    frames = replace(frames, range_m=frames.range_m - problem.sensor.zone_offsets)  # the range offset is estimated
+    evidence = Evidence.from_frames(frames, problem.on)
+    check_view(model, evidence, problem.assumed)
+    edges = model.has_background or not returns_beside(model, evidence)
+    noise_measured = frames.amplitude_e is not None or frames.std_from_scatter or problem.sensor.kind == "direct"
+
+    def fit_with(std: PoseStd | None) -> StillFit:
+        factor = None if std is None or std.exact else std.factor(poses)
+        return StillFit(model, evidence, problem.names, factor, edges=edges, noise_measured=noise_measured)
+
+    fit = fit_with(pose_std)
+    theta = fit.start(problem.assumed.vector)
+    use = fit.pixels(model.images(theta), cautious=True)
+    check_pixels(use, poses)
+    check_observable(fit.information(theta, use), fit.free, fit.scale, poses)
+    place = fit.solve(theta, use)
+    if fit.p_value(place, less=_MINIMA_COST) >= FALSE_ALARM:
+        place = fit.search(place)
+    estimated = None
+    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
+        for _ in range(_ROUNDS):
+            estimated = fit.pose_std(place)
+            fit = fit_with(estimated)
+            place = fit.solve(place.theta, place.use, place.shift)
+    return _solution(problem, fit, place, frames, estimated)
+
+
+def _solution(
+    problem: Problem, fit: StillFit, place: Place, frames: FilteredFrames, estimated: PoseStd | None
+) -> Solution:
+    """Return the result of a fit; `estimated` are the pose errors found from the residuals, if they were."""
+    poses, use = problem.poses, place.use
+    information, scatter = fit.knowledge(place)
+    check_observable(information, fit.free, fit.scale, poses)
+    plain = covariance_of(information, fit.scale, weak="wide")
+    dof, p_value, pose_chi2 = fit.dof(place), fit.p_value(place), (place.residual**2).sum(axis=1)
+    covariance, expected, source = plain, float(max(dof, 1)), "the noise law"
+    if frames.std_from_scatter:
+        # weights that were estimated from ν + 1 frames are too large in the mean by ν / (ν − 2), and scatter themselves
+        nu = max(float(np.median(frames.n_effective.reshape(len(poses), -1)[use])) - 1, 5.0)
+        covariance, expected, source = plain * nu / (nu - 4), expected * nu / (nu - 2), "the scatter of the frames"
+    notes = [] if estimated is None else [sentences.pose_std_note(estimated)]
+    count = use.sum(axis=1) * fit.evidence.per_pixel
+    if dof > 0 and p_value < FALSE_ALARM:
+        excess, n, p = place.cost / expected, len(poses), len(fit.free)
+        if n >= _POSES_FOR_SANDWICH * p:
+            covariance = plain @ scatter @ plain * n / (n - p)
+            source = "the scatter of the poses (sandwich), for the residuals are more than noise"
+        else:
+            covariance = covariance * excess
+            source += f", scaled by χ² = {excess:.3g} for each degree of freedom, for the residuals are more than noise"
+        notes += sentences.misfit_notes(excess, p_value, poses, pose_chi2 / np.maximum(count, 1))
+    notes += sentences.unused_notes(fit.edges, poses, count)
+    notes += sentences.observability_notes(fit.free, covariance, fit.scale, poses)
+    before, after = (
+        range_residual(fit.evidence, images) for images in (fit.model.images(problem.assumed.vector), place.images)
+    )
+    sensor_fields = {}
+    if estimated is not None and problem.sensor.kind == "direct":
+        across = estimated.position_m / float(np.median(poses.distance_m))
+        sensor_fields = {
+            "systematic_distance_m": rounded(estimated.position_m),
+            "systematic_delta_deg": rounded(math.degrees(math.hypot(estimated.delta_rad, across))),
+            "systematic_bearing_deg": rounded(math.degrees(math.hypot(estimated.heading_rad, across))),
+        }
+    return Solution(
+        problem=problem,
+        theta=place.theta,
+        covariance=covariance,
+        covariance_from=source,
+        chi2=place.cost,
+        dof=dof,
+        p_value=p_value,
+        use=use,
+        residual_m=in_image(after, use, problem.sensor),
+        residual_before_m=in_image(before, use, problem.sensor),
+        range_std_m=in_image(np.maximum(fit.evidence.seen.weight, 1e-300) ** -0.5, use, problem.sensor),
+        pose_shift=place.shift,
+        pose_chi2=pose_chi2,
+        held_out_m=fit.held_out(place, before, after),
+        edges=fit.edges,
+        notes=tuple(notes),
+        sensor_fields=sensor_fields,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +179,7 @@ class Place:
     Parameters
     ----------
     theta : (21,) float64
-        Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting_model.ALL_NAMES`.
+        Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
     u : (K, q) float64
         Errors of the poses, of unit variance each.
     shift : (K, 3) float64
@@ -91,50 +203,25 @@ class Place:
     cost: float
 
 
-@dataclass(frozen=True, eq=False)
-class Knowledge:
-    """Information of the frames on the free parameters at one place.
-
-    Parameters
-    ----------
-    information : (p, p) float64
-        Uncertain poses taken into account.
-    scatter : (p, p) float64
-        Sum of outer products of the poses' own gradients: the middle of a sandwich.
-    """
-
-    information: NDArray[np.float64]
-    scatter: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Blocks:
-    """A linearised problem, whitened; R residuals a pose.
-
-    Parameters
-    ----------
-    residual : (K, R) float64
-        Without any errors of the poses.
-    mounting : (K, p, R) float64
-        Slopes by the free parameters, natural units.
-    pose : (K, 4, R) float64
-        Slopes by errors of unit size.
-    """
-
-    residual: NDArray[np.float64]
-    mounting: NDArray[np.float64]
-    pose: NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
 class _Linear:
-    """Slopes at a mounting, whitened, and the normal matrix with the errors of the poses eliminated."""
+    """Slopes at a mounting, whitened, and the normal matrix with the errors of the poses eliminated.
 
-    rows: NDArray[np.float64]  # (K, p, R)
-    own_rows: NDArray[np.float64]  # (K, q, R)
-    cross: NDArray[np.float64]  # (K, p, q)
-    own: NDArray[np.float64]  # (K, q, q)
-    information: NDArray[np.float64]  # (p, p)
+    Parameters
+    ----------
+    rows : (K, p, R) float64
+        By the mounting.
+    own_rows : (K, q, R) float64
+        By errors of the poses of unit variance.
+    """
+
+    def __init__(self, rows: NDArray[np.float64], own_rows: NDArray[np.float64]) -> None:
+        self.rows, self.own_rows = rows, own_rows
+        self.cross = rows @ own_rows.transpose(0, 2, 1)
+        self.own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(own_rows.shape[1])
+        eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
+        self.pose_information = rows @ rows.transpose(0, 2, 1) - self.cross @ eliminated
+        """Of each pose on the mounting, (K, p, p)."""
+        self.information = self.pose_information.sum(axis=0)
 
     def gradients(
         self, residual: NDArray[np.float64], u: NDArray[np.float64]
@@ -143,11 +230,6 @@ class _Linear:
         own = np.einsum("kqr,kr->kq", self.own_rows, residual) - u
         eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
-
-    def pose_information(self) -> NDArray[np.float64]:
-        """Return the information of each pose on the mounting, its own errors eliminated, (K, p, p)."""
-        eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
-        return np.asarray(self.rows @ self.rows.transpose(0, 2, 1) - self.cross @ eliminated)
 
     def own_step(self, own_gradient: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much each pose's errors move with a step of the mounting, (K, q)."""
@@ -161,7 +243,7 @@ class _Linear:
         return np.asarray(np.linalg.solve(self.own, own_gradient[..., None])[..., 0])
 
 
-class Fit:
+class StillFit:
     """One calibration problem.
 
     Parameters
@@ -170,7 +252,7 @@ class Fit:
     evidence : Evidence
         Filtered frames, one for each pose.
     free : sequence of str
-    factor : (K, 3, q) float64 or None
+    factor : (K, 3, q) float64, optional
         Root of the covariance of each pose's errors; None: they are exact.
     edges : bool
         Whether pixels that see the landmark in part may count.
@@ -183,13 +265,13 @@ class Fit:
         model: CalibrationModel,
         evidence: Evidence,
         free: Sequence[str],
-        factor: NDArray[np.float64] | None,
+        factor: NDArray[np.float64] | None = None,
         *,
         edges: bool,
         noise_measured: bool = True,
     ) -> None:
         self.model, self.evidence, self.free = model, evidence, tuple(free)
-        self.columns = np.array([ALL_NAMES.index(name) for name in free])
+        self.columns = columns_of(free)
         self.scale = model.scale[self.columns]
         k = len(evidence.weight)
         self.factor = np.zeros((k, 3, 0)) if factor is None else factor
@@ -199,22 +281,22 @@ class Fit:
     def start(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Move a mounting to where outlines agree (see :func:`register`); set range offset and albedo by averages."""
         theta = register(self.model, self.evidence, theta, [name for name in OUTLINE if name in self.free]).copy()
-        images = self.model.images(theta, self._no_shift)
-        full = (self.evidence.weight > 0) & (images.coverage > _FULL)
+        images = self.model.images(theta)
+        full = (self.evidence.weight > 0) & self.model.alone(images)
         if "range_offset" in self.free and full.any():
             turned = self.evidence.value[full] * images.phasor[full].conj()
             mean = np.angle((turned / np.abs(turned)).sum())  # so that no range wraps about the median
             late = mean + np.median(np.angle(turned * np.exp(-1j * mean)))
             theta[ALL_NAMES.index("range_offset")] += self.evidence.sensor.metres_per_radian * late
         if "albedo" in self.free and self.evidence.on == "phasors":
-            use = self.pixels(theta, images, cautious=True)
+            use = self.pixels(images, cautious=True)
             measured = np.abs(self.evidence.value[use]).sum()
             modelled = np.abs(images.phasor[use]).sum()
             if measured > 0 and modelled > 0:
                 theta[ALL_NAMES.index("albedo")] *= measured / modelled
         return theta
 
-    def pixels(self, theta: NDArray[np.float64], images: Images, *, cautious: bool = False) -> NDArray[np.bool_]:
+    def pixels(self, images: Images, *, cautious: bool = False) -> NDArray[np.bool_]:
         """Return which pixels count at a mounting, (K, pixels).
 
         Those that returned and that one frame can measure (PHYSICS section 7): on phasors by what the model says, for
@@ -229,16 +311,8 @@ class Fit:
             clear = std <= limit * (1 + 1e-9)
         use = (self.evidence.weight > 0) & (images.phasor != 0) & clear
         if not self.edges:
-            full = images.coverage > _FULL
-            if cautious:
-                shaped = full.reshape(len(full), sensor.rows, sensor.cols)
-                full = ndimage.minimum_filter(shaped, size=(1, 3, 3), mode="nearest").reshape(full.shape)
-            use &= full
+            use &= self.model.alone(images, from_edges=cautious)
         return np.asarray(use)
-
-    @property
-    def _no_shift(self) -> NDArray[np.float64]:
-        return np.zeros((len(self.evidence.weight), 3))
 
     def solve(
         self, theta: NDArray[np.float64], use: NDArray[np.bool_], shift: NDArray[np.float64] | None = None
@@ -252,8 +326,9 @@ class Fit:
         shift : (K, 3) float64, optional
             Errors of the poses to start from; None: none.
         """
-        shift = self._no_shift if shift is None else shift
-        u = np.einsum("kji,ki->kj", np.linalg.pinv(self.factor), shift)
+        u = np.zeros((len(use), self.factor.shape[2]))
+        if shift is not None:
+            u = np.einsum("kji,ki->kj", np.linalg.pinv(self.factor), shift)
         place = self._descend(self._at(theta, u, use))
         for _ in range(2):
             place = self._with_its_pixels(place)
@@ -273,48 +348,87 @@ class Fit:
                 break
         return self._with_its_pixels(place)
 
-    def knowledge(self, place: Place) -> Knowledge:
-        """Return the uncertainty of a place, from slopes that no corner and no faint pixel distort."""
+    def knowledge(self, place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the information of a place, from slopes that no corner and no faint pixel distort, and its scatter.
+
+        Returns
+        -------
+        information : (p, p) float64
+            On the free parameters, uncertain poses taken into account.
+        scatter : (p, p) float64
+            Sum of outer products of the poses' own gradients: the middle of a sandwich.
+        """
         linear = self._linearise_wide(place, _WIDTHS)
         by_pose, _ = linear.gradients(self._pull(place), place.u)
-        return Knowledge(linear.information, by_pose.T @ by_pose)
+        return linear.information, by_pose.T @ by_pose
 
     def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return the information of some pixels in a mounting, (p, p), at little cost."""
         return self._linearise(self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)).information
 
-    def linear(self, place: Place) -> _Linear:
-        """Linearise about a place, with slopes over the standard deviations."""
-        return self._linearise_wide(place)
+    def dof(self, place: Place) -> int:
+        """Return the degrees of freedom of the fit."""
+        return int(place.use.sum()) * self.evidence.per_pixel - len(self.free)
+
+    def p_value(self, place: Place, *, less: float = 0.0) -> float:
+        """Return the chance of a χ² as large as that of a place less something."""
+        cost, dof = np.array([max(place.cost - less, 0.0)]), np.array([self.dof(place)])
+        return float(p_values_of(cost, dof, self.evidence.scatter_freedom[:1])[0])
+
+    def pose_std(self, place: Place) -> PoseStd:
+        """Return the sizes of the poses' errors of the greatest restricted likelihood, linearised about a place."""
+        names = (*self.free, *POSE[:3])
+        slope = self._whitened(self.model.slopes(place.theta, names, self.evidence.on, shift=place.shift), place)
+        rows, own = np.split(slope, [len(self.free)], axis=1)
+        errors = np.einsum("kij,kir->kjr", PoseStd(1.0, 1.0, 1.0).factor(self.model.poses), own)
+        exact = place.residual + np.einsum("kir,ki->kr", own, place.shift)
+        effects = RandomEffects.of_frames(rows * self.scale[:, None], errors, exact)
+        found = [
+            optimize.minimize(
+                lambda log: effects.minus_two_log(np.exp(log)[[0, 0, 1, 2]]),  # a lens moves along and across
+                start,
+                method="Nelder-Mead",
+                bounds=_STD_BOUNDS,
+                options={"xatol": 0.02, "fatol": 0.02},
+            )
+            for start in _STD_STARTS
+        ]
+        best = min(found, key=lambda one: float(one.fun))
+        return PoseStd(*np.exp(best.x).tolist())
+
+    def held_out(
+        self, place: Place, before_m: NDArray[np.float64], after_m: NDArray[np.float64]
+    ) -> tuple[float, float]:
+        """Return the r.m.s. residual of each pose with the mounting assumed, and with that of all other poses.
+
+        The second by the jackknife of the linearised problem: without pose k the mounting moves by −(H − H_k)⁻¹ g_k.
+        """
+        both = place.use & np.isfinite(before_m) & np.isfinite(after_m)
+        if len(both) <= FEWEST_POSES or not both.any():
+            return math.nan, math.nan
+        linear = self._linearise_wide(place)
+        by_pose, _ = linear.gradients(place.residual, place.u)
+        slope = self.model.slopes(place.theta, self.free, "ranges", shift=place.shift)
+        slope_m, after_m = self.evidence.sensor.metres_per_radian * slope.imag, after_m.copy()
+        for k, gradient in enumerate(by_pose):
+            left = linear.information - linear.pose_information[k]
+            step = covariance_of(left, self.scale, weak="wide") @ gradient
+            after_m[k] += np.einsum("pr,p->r", slope_m[k], np.clip(step, -10 * self.scale, 10 * self.scale))
+        return rms(before_m[both]), rms(after_m[both])
 
     def _with_its_pixels(self, place: Place) -> Place:
         """Decide again which pixels count, and descend from the place if they changed."""
-        use = self.pixels(place.theta, place.images)
+        use = self.pixels(place.images)
         return place if (use == place.use).all() else self._descend(self._at(place.theta, place.u, use))
-
-    def blocks(self, place: Place, unit: NDArray[np.float64]) -> Blocks:
-        """Linearise about a place.
-
-        Parameters
-        ----------
-        place : Place
-        unit : (K, 3, 4) float64
-            How (D, δ, b) of each pose change with errors of unit size.
-        """
-        slope, of_pose = self.model.slopes(place.theta, place.shift, self.free, self.evidence.on, of_poses=True)
-        rows, own = self._whitened(slope, place), self._whitened(of_pose, place)
-        without = place.residual + np.einsum("kir,ki->kr", own, place.shift)
-        return Blocks(without, rows * self.scale[:, None], np.einsum("kij,kir->kjr", unit, own))
 
     def _residual(self, images: Images, use: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Return whitened residuals, (K, pixels), on phasors (K, 2 · pixels)."""
         evidence = self.evidence
         root = np.sqrt(np.where(use, evidence.weight, 0.0))
         if evidence.on == "ranges":
-            turned = np.angle(evidence.value * images.phasor.conj())
-            residual = evidence.sensor.metres_per_radian * turned * root
             # what the model has left since the pixels were chosen disagrees, at a price that no move can lower to none
-            return np.where(use & (images.phasor == 0), math.sqrt(DISAGREEMENT), residual)
+            lost = np.where(use, math.sqrt(DISAGREEMENT), 0.0)
+            return np.where(images.phasor == 0, lost, range_residual(evidence, images) * root)
         difference = (evidence.value - images.phasor) * root
         return np.concatenate([difference.real, difference.imag], axis=1)
 
@@ -341,22 +455,15 @@ class Fit:
 
     def _linearise(self, place: Place, *widths: NDArray[np.float64]) -> _Linear:
         """Take slopes over the least widths, or those given; over several, the median of each pixel's."""
-        q = self.factor.shape[2]
+        names = (*self.free, *POSE[:3]) if self.factor.shape[2] else self.free
         found = [
-            self.model.slopes(place.theta, place.shift, self.free, self.evidence.on, of_poses=q > 0, width=width)
+            self._whitened(
+                self.model.slopes(place.theta, names, self.evidence.on, shift=place.shift, width=width), place
+            )
             for width in widths or (None,)
         ]
-        rows = np.median([self._whitened(slope, place) for slope, _ in found], axis=0)
-        own_rows = np.zeros((len(rows), 0, rows.shape[2]))
-        if q:
-            # the mount's bearing and a pose's move an image alike: only the same slopes cancel where they should
-            of_pose = np.median([self._whitened(slope, place) for _, slope in found], axis=0)
-            own_rows = np.einsum("kij,kir->kjr", self.factor, of_pose)
-        cross = rows @ own_rows.transpose(0, 2, 1)
-        own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(q)
-        eliminated = np.linalg.solve(own, cross.transpose(0, 2, 1))  # (K, q, p)
-        information = (rows @ rows.transpose(0, 2, 1) - cross @ eliminated).sum(axis=0)
-        return _Linear(rows, own_rows, cross, own, information)
+        rows, own = np.split(np.median(found, axis=0), [len(self.free)], axis=1)
+        return _Linear(rows, np.einsum("kij,kir->kjr", self.factor[:, : own.shape[1]], own))
 
     def _linearise_wide(self, place: Place, widths: Sequence[float] = (1.0,)) -> _Linear:
         """Take slopes over multiples of the standard deviations that slopes at the place give."""
@@ -402,15 +509,9 @@ class Fit:
         return place
 
     def _stepped(
-        self,
-        place: Place,
-        linear: _Linear,
-        own_gradient: NDArray[np.float64],
-        step: NDArray[np.float64],
+        self, place: Place, linear: _Linear, own_gradient: NDArray[np.float64], step: NDArray[np.float64]
     ) -> Place:
-        whole = np.zeros(len(ALL_NAMES))
-        whole[self.columns] = step
-        theta = self.model.moved(place.theta, whole)
+        theta = self.model.stepped(place.theta, self.columns, step)
         return self._at(theta, place.u + linear.own_step(own_gradient, step), place.use)
 
     def _lower(self, place: Place) -> Place:

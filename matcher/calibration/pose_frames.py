@@ -1,0 +1,108 @@
+"""Frames of known poses: which belong to each, and one filtered frame of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from phasemark import UsageError
+from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, assumed_std_m
+from phasemark.matcher.filters.kalman_filters import kalman_filter
+from phasemark.matcher.filters.mean_phasor import phasor_mean
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.render import Frames
+
+_FRAMES_FOR_SCATTER = 10
+"""Frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law."""
+
+
+def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:
+    """Assign frames to each pose.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        What was read from each file, in order: one position a pose; or one position whose frames belong to all poses
+        in turn, `KnownPoses.frames` each or all the same number.
+    poses : KnownPoses
+        Known poses of the camera.
+
+    Returns
+    -------
+    list of Frames
+        One position each, as many as poses.
+
+    Raises
+    ------
+    UsageError
+        The numbers do not fit.
+    """
+    positions = [one[k : k + 1] for one in frames for k in range(len(one))]
+    n = len(poses)
+    if len(positions) == n:
+        if poses.frames is not None:
+            for k, (own, stated) in enumerate(zip(positions, poses.frames, strict=True)):
+                if own.n_frames != stated:
+                    raise UsageError(f"{poses.where(k)}: 'frames' says {stated}, but there are {own.n_frames}")
+        return positions
+    if len(positions) != 1:
+        raise UsageError(f"there are {n} poses, but frames of {len(positions)} positions: each pose needs its own")
+    whole = positions[0]
+    total = whole.n_frames
+    counts = poses.frames
+    if counts is None:
+        if total % n:
+            raise UsageError(
+                f"{total} frames cannot be shared among {n} poses alike: give each pose a file of its own, or a column"
+                " 'frames' with the number of each"
+            )
+        counts = np.full(n, total // n)
+    if counts.sum() != total:
+        raise UsageError(f"the poses claim {counts.sum()} frames in all, but there are {total}")
+    ends = np.cumsum(counts)
+    return [whole.some_frames(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]
+
+
+def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
+    """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
+
+    Parameters
+    ----------
+    frames : sequence of Frames
+        One position each, of one camera; they may differ in number.
+    on : {"auto", "ranges", "phasors"}
+        As for :func:`~phasemark.matcher.calibrate`.
+
+    Returns
+    -------
+    FilteredFrames
+        As many positions.
+    """
+    lit = all(one.amplitude_e is not None and one.intensity_e is not None for one in frames)
+    several = len(frames[0].sensor.frequencies_hz) > 1
+    coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase" and not several)
+    parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
+    parts = [
+        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part
+        for part, one in zip(parts, frames, strict=True)
+    ]
+
+    joined: dict[str, Any] = {}
+    for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective", "time_s"):
+        arrays = [getattr(part, name) for part in parts]
+        joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
+    scattered = any(part.std_from_scatter for part in parts)
+    return replace(parts[0], std_from_scatter=scattered, by_frequency=(), **joined)
+
+
+def _with_known_noise(frames: FilteredFrames) -> FilteredFrames:
+    """Replace noise that few frames told by their scatter by what the camera's law says of a surface of albedo 0.8."""
+    if not frames.std_from_scatter:
+        return frames
+    law = assumed_std_m(np.nan_to_num(frames.range_m, nan=1.0), frames.sensor)
+    std = np.where(frames.n_effective > 0, law / np.sqrt(np.maximum(frames.n_effective, 1.0)), np.nan)
+    return replace(frames, std_m=std, std_from_scatter=False)

@@ -1,0 +1,200 @@
+"""Problem and solution of a calibration: the two ends that fits of still and of moving cameras share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.calibration.mounting import Mounting
+from phasemark.matcher.calibration.mounting_model import CalibrationModel
+from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
+from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
+from phasemark.matcher.filters.stamps import spread_stamps, stamp_jitter
+from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.one_frequency import OneFrequency
+from phasemark.matcher.pixel_agreement import MIN_RETURNS
+from phasemark.render import Background, Sensor
+
+FEWEST_POSES = 3
+"""Minimum number of poses. Fewer suffice if fewer parameters are free."""
+_DELAY_REACH_S = 0.3
+"""Longest delay that is estimated, seconds: frames nearer to a gap between poses are left out."""
+_MOST_FRAMES = 800
+"""Frames of a recording that enter; more are thinned evenly."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Frames at known poses, and everything that is assumed of them.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+    frames : FilteredFrames
+        One for each pose, or with `track` in the order of time.
+    poses : KnownPoses
+    assumed : Mounting
+    names : tuple of str
+        What is free.
+    on : {"ranges", "phasors"}
+    background : Background, optional
+    reports_z : bool
+    zones : bool
+        Whether the offsets of zones and the noise law of a direct sensor are estimated.
+    workers : int
+    rendered : callable
+        Called each time all poses have been rendered.
+    one : OneFrequency, optional
+        How a camera of several modulation frequencies became that of the frames.
+    track : PoseTrack, optional
+        Of a moving camera.
+    """
+
+    mesh: trimesh.Trimesh
+    frames: FilteredFrames
+    poses: KnownPoses
+    assumed: Mounting
+    names: tuple[str, ...]
+    on: ResidualKind
+    background: Background | None
+    reports_z: bool
+    zones: bool
+    workers: int
+    rendered: Callable[[], None]
+    one: OneFrequency | None
+    track: PoseTrack | None = None
+
+    @property
+    def sensor(self) -> Sensor:
+        """The camera before the calibration."""
+        return self.frames.sensor
+
+    def model(self) -> CalibrationModel:
+        """Return the model of the frames under any mounting."""
+        return CalibrationModel(
+            self.mesh,
+            self.sensor,
+            self.poses,
+            albedo=self.assumed.albedo,
+            background=self.background,
+            reports_z=self.reports_z,
+            workers=self.workers,
+            rendered=self.rendered,
+            track=self.track,
+            stamp_s=self.frames.time_s,
+            one=self.one,
+        )
+
+    def poses_with(self, delay_s: float) -> KnownPoses:
+        """Return the poses of the frames; those of a moving camera at their stamps plus a delay."""
+        if self.track is None or self.frames.time_s is None:
+            return self.poses
+        times = self.frames.time_s + delay_s
+        distance, delta, bearing, height = np.ascontiguousarray(self.track.at(times)[0].T)
+        place = tuple(f"pose at {time:.3f} s" for time in times)
+        return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
+
+    def by_time(self) -> tuple[Problem, list[str]]:
+        """Return the problem with poses by time and the frames that have one, and notes on what was left out."""
+        frames = self.frames
+        if self.poses.wall_m is not None:
+            raise UsageError("'wall_m' belongs to still poses: leave it out for a moving camera")
+        if frames.time_s is None:
+            raise UsageError(
+                "the frames have no time stamps: a moving camera takes a recording with a column t_ms or t_s"
+            )
+        track = PoseTrack.of(self.poses)
+        stamps = spread_stamps(frames.time_s)
+        _, same, counts = np.unique(stamps, return_inverse=True, return_counts=True)
+        unclear = (counts[same] > 1) | (stamps < np.maximum.accumulate(stamps))
+        delay = self.assumed.delay_s
+        reach = max(_DELAY_REACH_S, abs(delay)) if "delay" in self.names else 0.0
+        known = track.known(stamps + delay - reach, stamps + delay + reach)
+        index = np.flatnonzero(~unclear & known & (returns_of(frames) >= MIN_RETURNS))
+        index = index[np.argsort(stamps[index], kind="stable")]
+        if len(index) < max(FEWEST_POSES, len(self.names)):
+            raise UsageError(
+                f"{len(index)} of {len(frames)} frames have a pose at their time: frames are stamped from"
+                f" {stamps.min():.6g} to {stamps.max():.6g} s and poses from {track.pieces[0][0]:.6g} to"
+                f" {track.pieces[-1][1]:.6g} s; are both in one clock and in the unit of their column?"
+            )
+        gap = f"frames were left out, for no poses within {LONGEST_GAP_S:g} s of each other surround them"
+        counted = {
+            "frames got a time of their own in a gap beside their repeated stamps": (stamps != frames.time_s).sum(),
+            "poses were left out, for their stamps repeat or run backwards": track.dropped,
+            "frames were left out, for their stamps repeat or run backwards": unclear.sum(),
+            gap: (~known & ~unclear).sum(),
+        }
+        notes = [f"{n} {words}." for words, n in counted.items() if n]
+        if len(index) > _MOST_FRAMES:
+            notes.append(f"Of {len(index)} frames {_MOST_FRAMES} entered, evenly spaced.")
+            index = index[np.linspace(0, len(index) - 1, _MOST_FRAMES).round().astype(int)]
+        track = replace(track, jitter_s=max(track.jitter_s, stamp_jitter(frames.time_s)))
+        timed = replace(self, frames=replace(frames, time_s=stamps)[index], track=track)
+        return replace(timed, poses=timed.poses_with(delay)), notes
+
+
+def returns_of(frames: FilteredFrames) -> NDArray[np.int64]:
+    """Return the number of pixels that returned at each position, (n,)."""
+    return np.asarray((frames.state == PixelState.RETURN).reshape(len(frames), -1).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Fitted:
+    """Fields that a solution and the calibration made of it share; the latter documents them."""
+
+    covariance: NDArray[np.float64]
+    covariance_from: str
+    chi2: float
+    dof: int
+    p_value: float
+    pose_shift: NDArray[np.float64]
+    pose_chi2: NDArray[np.float64]
+    residual_m: NDArray[np.float64]
+    residual_before_m: NDArray[np.float64]
+    range_std_m: NDArray[np.float64]
+    notes: tuple[str, ...]
+    held_out_m: tuple[float, float] = (math.nan, math.nan)
+    left_out: float = 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Solution(Fitted):
+    """Result of a fit, beside the fields of :class:`Fitted`.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was solved: of a moving camera with the frames that have a pose.
+    theta : (21,) float64
+        Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
+    use : (K, pixels) bool
+        Which pixels count.
+    edges : bool
+        Whether pixels that see the landmark in part may count.
+    sensor_fields : mapping of str to value
+        Fields of the sensor that were estimated beside the mounting.
+    """
+
+    problem: Problem
+    theta: NDArray[np.float64]
+    use: NDArray[np.bool_]
+    edges: bool
+    sensor_fields: Mapping[str, object] = field(default_factory=dict)
+
+
+def in_image(values: NDArray[np.float64], use: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float64]:
+    """Return values of pixels, (K, pixels), as images (K, rows, cols); NaN where a pixel does not count."""
+    return np.where(use, values, np.nan).reshape(-1, sensor.rows, sensor.cols)
+
+
+def rms(values: NDArray[np.float64]) -> float:
+    """Return the root mean square; NaN of nothing."""
+    return math.sqrt(float((values**2).mean())) if values.size else math.nan
