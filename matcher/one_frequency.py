@@ -18,7 +18,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
@@ -216,32 +216,17 @@ class OneFrequency:
                 ' frames with what each of them measured, or match with method="refine" on="ranges" and no background'
             )
 
-        def stacked(name: str, scale: ArrayLike = 1.0) -> NDArray[Any] | None:
+        as_first = (self._metres[0] / self._metres)[:, None, None]
+        stacked: dict[str, Any] = {}
+        for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective"):
             values = [getattr(part, name) for part in parts]
             if any(one is None for one in values):
-                return None
-            layers = np.stack(values, axis=1)
-            return self.stack(layers if name == "state" else layers * np.asarray(scale).reshape(-1, 1, 1))
-
-        as_first = self._metres[0] / self._metres
-        range_m, std_m = stacked("range_m", as_first), stacked("std_m", as_first)
-        state, n_effective = stacked("state"), stacked("n_effective")
-        assert range_m is not None
-        assert std_m is not None
-        assert state is not None
-        assert n_effective is not None
-        return replace(
-            frames,
-            range_m=range_m,
-            std_m=std_m,
-            amplitude_e=stacked("amplitude_e"),
-            intensity_e=stacked("intensity_e"),
-            state=state,
-            n_effective=n_effective,
-            sensor=sensor,
-            std_from_scatter=any(part.std_from_scatter for part in parts),
-            by_frequency=(),
-        )
+                stacked[name] = None
+            else:
+                layers = np.stack(values, axis=1)
+                stacked[name] = self.stack(layers * as_first if name in ("range_m", "std_m") else layers)
+        scattered = any(part.std_from_scatter for part in parts)
+        return replace(frames, **stacked, sensor=sensor, std_from_scatter=scattered, by_frequency=())
 
     def _of_frames(self, sensor: Sensor) -> Sensor:
         """Return the camera of one frequency with the noise and the calibration of the frames' own sensor."""

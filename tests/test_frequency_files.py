@@ -1,7 +1,5 @@
 """Files of several modulation frequencies: banks, frame sets, exports, and what somebody else measured."""
 
-import hashlib
-
 import h5py
 import numpy as np
 import pytest
@@ -48,8 +46,14 @@ def frames_file(tmp_path_factory):
     return path
 
 
-def sha256(path):
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+@pytest.fixture
+def sensor_file(tmp_path):
+    path = tmp_path / "two.toml"
+    path.write_text(
+        "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n",
+        encoding="utf-8",
+    )
+    return str(path)
 
 
 def taken(n_frames=3):
@@ -96,7 +100,7 @@ def test_a_frame_set_is_as_large_as_planned_and_the_same_from_shards(frames_file
         build_part(FRAMES, (k, 2), part, workers=1)
         parts.append(part)
     merge_parts(parts, tmp_path / "merged.h5")
-    assert sha256(tmp_path / "merged.h5") == sha256(frames_file)
+    assert (tmp_path / "merged.h5").read_bytes() == frames_file.read_bytes()
 
 
 def test_a_frame_set_of_other_frequencies_than_its_sensor_is_refused(frames_file, tmp_path):
@@ -128,16 +132,15 @@ def test_a_bank_holds_phasors_at_every_frequency(tmp_path):
 @pytest.mark.parametrize("to", ["npz", "csv", "ply", "png16"])
 def test_frames_of_several_frequencies_are_exported(frames_file, tmp_path, to):
     with open_frames(frames_file) as opened:
-        written = export_frames(opened, tmp_path / f"out.{to}", to)
-        if to == "npz":
-            back, frames = read_frames(written, sensor=TWO), opened.frames()
-            for part, own in zip(back.by_frequency, frames.by_frequency, strict=True):
-                np.testing.assert_allclose(part.range_m[0], own.range_m[:, 0], atol=1e-6)
-            same = np.isfinite(back.range_m[0]) == np.isfinite(frames.range_m[:, 0])
-            assert same.mean() > 0.999  # what was dark at one frequency is no return here and NaN there
-        elif to == "csv":
-            back = read_frames(written, sensor=TWO)
-            assert back.by_frequency == ()
+        written, frames = export_frames(opened, tmp_path / f"out.{to}", to), opened.frames()
+    if to == "npz":
+        back = read_frames(written, sensor=TWO)
+        for part, own in zip(back.by_frequency, frames.by_frequency, strict=True):
+            np.testing.assert_allclose(part.range_m[0], own.range_m[:, 0], atol=1e-6)
+        same = np.isfinite(back.range_m[0]) == np.isfinite(frames.range_m[:, 0])
+        assert same.mean() > 0.999  # what was dark at one frequency is no return here and NaN there
+    elif to == "csv":
+        assert read_frames(written, sensor=TWO).by_frequency == ()
 
 
 def test_measured_frames_come_back_with_every_frequency(tmp_path):
@@ -191,49 +194,35 @@ def test_files_with_a_frequency_dimension_are_read_and_unwrapped(tmp_path, kind)
         np.testing.assert_array_equal(read.taps_e[0], frames.taps_e[0])
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda a: {**a, "frequency": [20e6, 50e6]},
-            "has frames at 20000000 and 50000000 Hz, but the sensor modulates",
-        ),
-        (lambda a: {**a, "frequency": [20e6]}, "has frames at 20000000 Hz, but the sensor modulates at 20000000 and"),
-        (
-            lambda a: {k: v[:, :1] for k, v in a.items()},
-            "'frequency_range' has 1 frequencies, but the sensor has 2: 20000000 and 60000000 Hz",
-        ),
-        (
-            lambda a: {**a, "taps": np.zeros((3, 4, 2, 16, 16))},
-            "'taps' has 4 phase images a frame, but the sensor takes 8: 4 at each of 2 modulation frequencies",
-        ),
-        (lambda a: {"frequency_amplitude": a["frequency_amplitude"]}, "must have an array 'range'"),
-        (lambda a: {**a, "frequency_amplitude": a["frequency_amplitude"][:2]}, "must have the frames of"),
-        (lambda a: {"frequency_range": a["frequency_range"][..., :8]}, "16 × 8 pixels, but the sensor's have 16 × 16"),
-    ],
-)
-def test_files_that_do_not_fit_the_frequencies_are_refused_in_one_line(tmp_path, change, message):
-    path = tmp_path / "frames.npz"
-    np.savez(path, **change(arrays_of(taken())), unit="m", quantity="range")
-    with pytest.raises(InputFileError) as error:
-        read_frames(path, sensor=TWO)
-    assert message in str(error.value)
-    assert str(error.value).startswith(str(path))
-    assert "\n" not in str(error.value)
+BOTH = "at 20000000 and 60000000 Hz"
+MISFITS = [
+    (lambda a: {**a, "frequency": [20e6, 50e6]}, "has frames at 20000000 and 50000000 Hz, but the sensor modulates"),
+    (lambda a: {**a, "frequency": [20e6]}, f"has frames at 20000000 Hz, but the sensor modulates {BOTH}"),
+    (lambda a: {k: v[:, :1] for k, v in a.items()}, "'frequency_range' has 1 frequencies, but the sensor has 2: 200"),
+    (
+        lambda a: {**a, "taps": np.zeros((3, 4, 2, 16, 16))},
+        "'taps' has 4 phase images a frame, but the sensor takes 8: 4 at each of 2 modulation frequencies",
+    ),
+    (lambda a: {"frequency_amplitude": a["frequency_amplitude"]}, "must have an array 'range'"),
+    (lambda a: {**a, "frequency_amplitude": a["frequency_amplitude"][:2]}, "must have the frames of"),
+    (lambda a: {"frequency_range": a["frequency_range"][..., :8]}, "16 × 8 pixels, but the sensor's have 16 × 16"),
+]
 
 
-def test_lines_of_csv_that_fit_no_number_of_frequencies_are_refused(tmp_path):
+def test_files_that_do_not_fit_the_frequencies_are_refused_in_one_line(tmp_path):
+    path, arrays = tmp_path / "frames.npz", arrays_of(taken())
+    one = (lambda a: a, "'frequency_range' has 2 frequencies, but the sensor has 1: 10000000 Hz")
+    for sensor, (change, message) in [*((TWO, misfit) for misfit in MISFITS), (preset("pmd-16x16"), one)]:
+        np.savez(path, **change(arrays), unit="m", quantity="range")
+        with pytest.raises(InputFileError) as error:
+            read_frames(path, sensor=sensor)
+        assert message in str(error.value)
+        assert str(error.value).startswith(str(path))
+        assert "\n" not in str(error.value)
     path = tmp_path / "frames.csv"
     path.write_text("# unit=m quantity=range\n" + ",".join(["1"] * 300) + "\n", encoding="utf-8")
     with pytest.raises(InputFileError, match=r"has 300 values, must have 512 \(16 × 16 pixels at each of 2 freq"):
         read_frames(path, sensor=TWO)
-
-
-def test_a_file_of_several_frequencies_is_refused_for_a_sensor_of_one(tmp_path):
-    path = tmp_path / "frames.npz"
-    np.savez(path, **arrays_of(taken()), unit="m", quantity="range")
-    with pytest.raises(InputFileError, match="'frequency_range' has 2 frequencies, but the sensor has 1: 10000000 Hz"):
-        read_frames(path, sensor=preset("pmd-16x16"))
 
 
 def test_a_simulated_recording_keeps_every_frequency():
@@ -242,31 +231,21 @@ def test_a_simulated_recording_keeps_every_frequency():
     assert [part.range_m.shape for part in recording.frames.by_frequency] == [(1, 2, 16, 16)] * 2
 
 
-def test_commands_render_and_show_several_frequencies(tmp_path, capsys):
-    sensor = tmp_path / "two.toml"
-    sensor.write_text(
-        "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n",
-        encoding="utf-8",
-    )
+def test_commands_render_and_show_several_frequencies(tmp_path, capsys, sensor_file):
     out = tmp_path / "one.png"
-    assert main(["render", "--class", "post", "--distance", "1", "--sensor", str(sensor), "-o", str(out)]) == 0
+    assert main(["render", "--class", "post", "--distance", "1", "--sensor", sensor_file, "-o", str(out)]) == 0
     with np.load(out.with_suffix(".npz")) as data:
         assert data["frequency"].tolist() == [20e6, 60e6]
         np.testing.assert_array_equal(data["frequency_phasor"][0], data["phasor"])
     capsys.readouterr()
-    assert main(["sensor", "show", str(sensor)]) == 0
+    assert main(["sensor", "show", sensor_file]) == 0
     shown = capsys.readouterr().out
     assert "# unambiguous range 7.4948 m, 1.192836, 0.397612 m per radian" in shown
     assert "modulation_hz = [20000000.0, 60000000.0]" in shown
 
 
-def test_a_distance_beyond_what_the_frequencies_tell_is_refused_with_the_divisor_that_would_do(tmp_path, capsys):
-    sensor = tmp_path / "two.toml"
-    sensor.write_text(
-        "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n",
-        encoding="utf-8",
-    )
-    options = ["--class", "post", "--distance", "1", "--wall", "10", "--sensor", str(sensor)]
+def test_a_distance_beyond_the_frequencies_is_refused_with_the_divisor_that_would_do(tmp_path, capsys, sensor_file):
+    options = ["--class", "post", "--distance", "1", "--wall", "10", "--sensor", sensor_file]
     assert main(["render", *options, "-o", str(tmp_path / "one.png")]) == 2
     (line,) = error_lines(capsys.readouterr().err)
     assert "--wall at 10 m is beyond c / (2 gcd f) = 7.495 m" in line
@@ -278,29 +257,21 @@ def test_flags_of_frames_and_files_are_the_same():
 
 
 @pytest.mark.parametrize("options", [[], ["--frequency", "30e6"]])
-def test_a_data_sheet_asks_which_frequency(tmp_path, capsys, options):
-    sensor = tmp_path / "two.toml"
-    sensor.write_text(
-        "rows = 2\ncols = 2\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n",
-        encoding="utf-8",
-    )
-    assert main(["sensor", "characterise", str(sensor), "-o", str(tmp_path / "sheet"), *options]) == 2
+def test_a_data_sheet_asks_which_frequency(tmp_path, capsys, sensor_file, options):
+    assert main(["sensor", "characterise", sensor_file, "-o", str(tmp_path / "sheet"), *options]) == 2
     (line,) = error_lines(capsys.readouterr().err)
     assert "--frequency must be one of the sensor's 20000000 and 60000000 Hz, got" in line
     assert not (tmp_path / "sheet").exists()
 
 
-def test_a_fit_takes_the_frequency_that_is_named(tmp_path, capsys):
-    fields = "rows = 16\ncols = 16\nhalf_angle_h_deg = 11\nhalf_angle_v_deg = 11\nmodulation_hz = [20e6, 60e6]\n"
-    sensor, out = tmp_path / "two.toml", tmp_path / "fitted.toml"
-    sensor.write_text(fields, encoding="utf-8")
-    files = []
+def test_a_fit_takes_the_frequency_that_is_named(tmp_path, capsys, sensor_file):
+    out, files = tmp_path / "fitted.toml", []
     for distance in (1.0, 1.6):
         image = Renderer(None, TWO).render(1.0, background=Background(wall_m=distance, wall_albedo=0.8))
         frames = capture(image, TWO, rng=np.random.default_rng(3), n_frames=12)
         files.append(write_measured(frames, tmp_path / f"board_{distance}.npz"))
     arguments = ["sensor", "fit", *map(str, files), "--distance", "1.0", "--distance", "1.6", "--albedo", "0.8"]
-    assert main([*arguments, "--sensor", str(sensor), "--frequency", "60e6", "-o", str(out)]) == 0
+    assert main([*arguments, "--sensor", sensor_file, "--frequency", "60e6", "-o", str(out)]) == 0
     capsys.readouterr()
     fitted = Sensor.from_toml(out)
     assert fitted.modulation_hz == 60e6

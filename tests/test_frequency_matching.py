@@ -1,13 +1,13 @@
 """Filters, bounds and matching of cameras with several modulation frequencies (PHYSICS section 10)."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
 from builders import cut_alike, wrapped
 from scipy import stats
-from test_calibrate import MESH, filtered, nees, some_mounting, some_poses
+from test_calibrate import MESH, filtered, some_mounting, some_poses
+from test_calibrate import nees as mounting_nees
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
@@ -20,6 +20,7 @@ from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.design import DesignPlan, turn_distance
 from phasemark.matcher.filters.filtered_frames import PixelState, noise_free
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import (
     Background,
     Frames,
@@ -134,75 +135,41 @@ def scene(bank, background, bearing_std_deg=1.0, seed=5):
     return renderer, renderer.render_views(views, background=background)
 
 
-def errors_of(matches, views):
-    delta = matches.delta_rad - views.delta_rad
-    delta -= math.pi * np.round(delta / math.pi)
-    return np.stack([matches.distance_m - views.distance_m, delta, matches.bearing_rad - views.bearing_rad], axis=1)
+WALL = Background(wall_m=3.0)
+# evidence, background, share that is accepted, numbers compared with the bound, slack of the mean NEES
+BOUNDS = {
+    "phasors": ("phasors", None, 0.8, VIEW[:3], 1.0),
+    # the start is a grid of 2°, and these ranges are good to half a millimetre
+    "unwrapped ranges": ("ranges", None, 0.6, VIEW[:1], 1.0),
+    # each frequency's wrapped range counts by itself: mixed pixels have no range that the frequencies agree on
+    "ranges before a wall": ("ranges", WALL, 0.8, VIEW[:3], 1.3),
+    "phasors before a wall": ("phasors", WALL, 0.8, VIEW[:3], 1.0),
+}
 
 
-@pytest.mark.parametrize("background", [None, pytest.param(Background(wall_m=3.0), marks=pytest.mark.soak)])
-def test_matching_on_phasors_reaches_the_bound_and_its_covariance_is_honest(bank, background):
+@pytest.mark.parametrize("case", [*list(BOUNDS)[:3], pytest.param("phasors before a wall", marks=pytest.mark.soak)])
+def test_matching_reaches_the_bound_and_its_covariance_is_honest(bank, case):
+    on, background, share, names, slack = BOUNDS[case]
     renderer, image = scene(bank, background)
-    frames = take(image, TWO.with_(max_phase_std_rad=None), 50)
-    matches = Matcher(bank, "refine", on="phasors", background=background).match(phasor_mean(frames))
+    if on == "phasors":
+        frames = phasor_mean(take(image, TWO.with_(max_phase_std_rad=None), 50))
+    else:
+        frames = kalman_filter(take(image, TWO, 50))
+    matches = Matcher(bank, "refine", on=on, background=background).match(frames)
     accepted = matches.accepted
-    assert accepted.mean() > 0.8
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
-    error = errors_of(matches, image.views)
-    bound = cramer_rao(
-        renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"), on="phasors", background=background
-    )
-    for k, name in enumerate(bound.free):
-        ratio = error[accepted, k] / bound.std(name)[accepted]
-        low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())  # 99.9 %, eight cells
+    assert accepted.mean() > share
+    assert (matches.class_name[accepted] == "cylinder").all()
+    error = view_errors(matches, image.views, VIEW[:3], np.pi)[accepted]
+    bound = cramer_rao(renderer, image.views, free=VIEW[:3], on=on, background=background)
+    low, high = stats.chi2.interval(1 - 0.001 / 8, len(error))  # 99.9 %, eight cells
+    for k, name in enumerate(names):
+        ratio = error[:, k] / bound.std(name)[accepted]
         assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
-    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
-    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
-    assert low < np.sum(nees) < high
+    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * len(error))
+    assert low < nees(error, matches.covariance[accepted]).sum() < slack * high
 
 
-def test_matching_on_unwrapped_ranges_reaches_the_bound(bank):
-    renderer, image = scene(bank, None)
-    matches = Matcher(bank, "refine").match(kalman_filter(take(image, TWO, 50)))
-    accepted = matches.accepted
-    assert accepted.mean() > 0.6  # the start is a grid of 2°, and these ranges are good to half a millimetre
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
-    error = errors_of(matches, image.views)
-    bound = cramer_rao(renderer, image.views, free=("distance_m", "delta_rad", "bearing_rad"))
-    ratio = np.sum((error[accepted, 0] / bound.std("distance_m")[accepted]) ** 2)
-    low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())
-    assert low < ratio < 1.3 * high
-    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
-    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
-    assert low < np.sum(nees) < high
-
-
-def test_ranges_before_a_wall_count_mixed_pixels_and_their_covariance_is_honest(bank):
-    """Each frequency's wrapped range counts by itself: mixed pixels have no range that the frequencies agree on."""
-    wall = Background(wall_m=3.0)
-    renderer, image = scene(bank, wall)
-    frames = kalman_filter(take(image, TWO, 50))
-    matches = Matcher(bank, "refine", background=wall).match(frames)
-    accepted = matches.accepted
-    assert accepted.mean() > 0.8
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
-    error = errors_of(matches, image.views)
-    bound = cramer_rao(renderer, image.views, free=VIEW[:3], background=wall)
-    for k, name in enumerate(bound.free):
-        ratio = error[accepted, k] / bound.std(name)[accepted]
-        low, high = stats.chi2.interval(1 - 0.001 / 8, accepted.sum())  # 99.9 %, eight cells
-        assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
-    nees = [error[k] @ np.linalg.solve(matches[k].covariance, error[k]) for k in np.flatnonzero(accepted).tolist()]
-    low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * accepted.sum())
-    assert low < np.sum(nees) < 1.3 * high
-    alone = replace(frames, by_frequency=())
-    with pytest.raises(UsageError, match=r'unwrapped ranges alone, .* on="ranges" and no background'):
-        Matcher(bank, "refine", background=wall).match(alone)
-
-
-@pytest.mark.parametrize(
-    "background", [None, pytest.param(Background(wall_m=3.0), marks=pytest.mark.soak)], ids=["alone", "wall"]
-)
+@pytest.mark.parametrize("background", [None, pytest.param(WALL, marks=pytest.mark.soak)], ids=["alone", "wall"])
 def test_all_six_numbers_are_found_on_phasors_of_two_frequencies(bank, background):
     rng, n = np.random.default_rng(12), 8
     tilts = [rng.normal(0, width, n) for width in (0.03, 0.03, 0.04, 0.06)]
@@ -216,24 +183,21 @@ def test_all_six_numbers_are_found_on_phasors_of_two_frequencies(bank, backgroun
     matches = matcher.match(frames)
     found = matches.accepted
     assert found.sum() >= n - 1  # a frame may end in another minimum, and is refused
-    assert {match.class_name for match in matches if match.accepted} == {"cone"}
-    error = np.column_stack([getattr(matches, name) - getattr(views, name) for name in VIEW])
-    error[:, 1] -= math.pi * np.round(error[:, 1] / math.pi)
-    nees = np.einsum("ni,nij,nj->n", error[found], np.linalg.inv(matches.covariance[found]), error[found])
+    assert (matches.class_name[found] == "cone").all()
+    squares = nees(view_errors(matches, views, VIEW, np.pi)[found], matches.covariance[found])
     # covariances are local beside edges before a wall: no error may be far beyond them; 99.9 % of the median of 8
-    assert np.median(nees) < 2.3 * stats.chi2.median(6)
-    assert nees.max() < 60
+    assert np.median(squares) < 2.3 * stats.chi2.median(6)
+    assert squares.max() < 60
 
 
-@pytest.mark.parametrize("background", [None, Background(wall_m=3.0)])
+@pytest.mark.parametrize("background", [None, WALL])
 def test_the_nearest_image_is_found_by_phases_of_every_frequency(bank, background):
     _, image = scene(bank, background, bearing_std_deg=0.0)
     matches = Matcher(bank, background=background).match(kalman_filter(take(image, TWO, 5)))
     accepted = matches.accepted
     assert accepted.mean() > 0.5
-    error = errors_of(matches, image.views)
-    assert np.abs(error[accepted, 0]).max() < 0.03
-    assert all(matches[k].class_name == "cylinder" for k in np.flatnonzero(accepted).tolist())
+    assert np.abs(matches.distance_m - image.views.distance_m)[accepted].max() < 0.03
+    assert (matches.class_name[accepted] == "cylinder").all()
 
 
 @pytest.mark.parametrize(("method", "on"), [("nearest", "ranges"), ("refine", "ranges"), ("refine", "phasors")])
@@ -288,17 +252,18 @@ def test_another_class_is_farther_away_in_two_frequencies_than_in_one():
 def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(bank):
     _, image = scene(bank, None)
     frames = take(image, TWO, 2)
-    alone = Frames(frames.range_m, flags=frames.flags, sensor=TWO)
-    with pytest.raises(UsageError, match="unwrapped ranges alone, and phases are compared at every modulation"):
-        Matcher(bank).match(kalman_filter(alone))
-    with pytest.raises(UsageError, match='background="auto" takes on="ranges"'):
-        Matcher(bank, "refine", on="phasors", background="auto")
-    with pytest.raises(UsageError, match="a data sheet takes a sensor of one modulation frequency, got"):
-        characterise(TWO, rng=np.random.default_rng(1))
-    with pytest.raises(UsageError, match="a fit takes a sensor of one modulation frequency"):
-        fit_sensor([frames[:1]], [1.0], base=TWO)
-    with pytest.raises(UsageError, match="another sensor than the bank's: 'modulation_hz' is"):
-        Matcher(bank).match(kalman_filter(take(Renderer(CYLINDER, PMD).render(1.0), PMD, 2)))
+    alone = kalman_filter(Frames(frames.range_m, flags=frames.flags, sensor=TWO))
+    other, rng = kalman_filter(take(Renderer(CYLINDER, PMD).render(1.0), PMD, 2)), np.random.default_rng(1)
+    for call, message in (
+        (lambda: Matcher(bank).match(alone), "unwrapped ranges alone, and phases are compared at every modulation"),
+        (lambda: Matcher(bank, "refine", background=WALL).match(alone), 'alone, .* on="ranges" and no background'),
+        (lambda: Matcher(bank, "refine", on="phasors", background="auto"), 'background="auto" takes on="ranges"'),
+        (lambda: characterise(TWO, rng=rng), "a data sheet takes a sensor of one modulation frequency, got"),
+        (lambda: fit_sensor([frames[:1]], [1.0], base=TWO), "a fit takes a sensor of one modulation frequency"),
+        (lambda: Matcher(bank).match(other), "another sensor than the bank's: 'modulation_hz' is"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            call()
 
 
 # Each frequency by itself
@@ -347,7 +312,7 @@ def test_a_camera_of_two_frequencies_is_calibrated_on_unwrapped_ranges():
             by_frequency=seen.by_frequency,
         )  # fmt: skip
         one = calibrate(MESH, filtered(frames), poses)
-        found.append(nees(one, truth))
+        found.append(mounting_nees(one, truth))
         assert one.sensor.modulation_hz == one.base.modulation_hz == (20e6, 60e6)
         assert one.sensor.pitch_deg == pytest.approx(math.degrees(truth.pitch_rad), abs=0.05)
         assert not one.doubts
