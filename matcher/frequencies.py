@@ -26,11 +26,6 @@ class _OneFrequencyGroup(BankGroup):
         """Return the group with some of its views alone."""
         return _OneFrequencyGroup(self._group.part(*which), self._one)
 
-    @property
-    def phasor(self) -> NDArray[np.complex64]:
-        """S, (views, row, col)."""
-        return self._reduced
-
     @cached_property
     def intensity(self) -> NDArray[np.float32]:
         """Mean amplitude, (views, row, col)."""
@@ -42,7 +37,8 @@ class _OneFrequencyGroup(BankGroup):
         return self._one.same_for_all(self._group.coverage)
 
     @cached_property
-    def _reduced(self) -> NDArray[np.complex64]:
+    def phasor(self) -> NDArray[np.complex64]:
+        """S, (views, row, col)."""
         hz = self._one.camera.frequencies_hz
         if self._one.stacked:
             return self._one.stack(np.stack([self._group.at_frequency(own) for own in hz], axis=-3))
@@ -58,7 +54,7 @@ class _OneFrequencyGroup(BankGroup):
         return out.reshape(self._group.phasor.shape)
 
 
-_IMAGES = ("intensity", "coverage")
+_IMAGES = ("phasor", "intensity", "coverage")
 _IMAGES_AT_ONCE = 4096
 
 
