@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, overload
+from typing import Any, Generic, Literal, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from phasemark.data.pages.notebook import table_html
 from phasemark.render import Background
 from phasemark.render.integral.rounding import with_error
 
+_T = TypeVar("_T", bound=np.generic)
 Reason = Literal["", "no landmark", "poor fit", "undetermined", "outside the bank", "ambiguous"]
 """Why an answer is refused; empty if it is accepted."""
 TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
@@ -236,6 +237,21 @@ def _number(value: float, form: str) -> str:
     return f"{value:{form}}" if math.isfinite(value) else ""
 
 
+class _Column(Generic[_T]):
+    """A field of all matches of a batch, as an array (n,)."""
+
+    def __init__(self, kind: type[_T]) -> None:
+        self._kind = kind
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, matches: Matches | None, owner: type) -> NDArray[_T]:
+        if matches is None:
+            return self  # type: ignore[return-value]
+        return np.array([getattr(match, self._name) for match in matches], dtype=self._kind)
+
+
 class Matches(Sequence[Match]):
     """The matches of a batch; the fields of :class:`Match` are there as arrays too.
 
@@ -264,6 +280,33 @@ class Matches(Sequence[Match]):
         Probability of each class.
     """
 
+    class_name = _Column(np.object_)
+    """Names, None where there is no landmark; (n,)."""
+    accepted = _Column(np.bool_)
+    """Whether each match passed its test; (n,)."""
+    reason = _Column(np.object_)
+    """Why each answer is refused, empty where it is accepted; (n,)."""
+    dof = _Column(np.int64)
+    """Degrees of freedom; (n,)."""
+    distance_m = _Column(np.float64)
+    """Distances; (n,)."""
+    delta_rad = _Column(np.float64)
+    """Angles δ; (n,)."""
+    bearing_rad = _Column(np.float64)
+    """Bearings; (n,)."""
+    height_m = _Column(np.float64)
+    """Heights; (n,)."""
+    pitch_rad = _Column(np.float64)
+    """Pitch angles of the camera; (n,)."""
+    roll_rad = _Column(np.float64)
+    """Roll angles of the camera; (n,)."""
+    chi2 = _Column(np.float64)
+    """Whitened squared residuals; (n,)."""
+    p_value = _Column(np.float64)
+    """Probabilities of a larger χ²; (n,)."""
+    condition_number = _Column(np.float64)
+    """Condition of the information in the free parameters; (n,)."""
+
     def __init__(self, matches: Iterable[Match]) -> None:
         self._matches = tuple(matches)
 
@@ -285,71 +328,6 @@ class Matches(Sequence[Match]):
 
     def __iter__(self) -> Iterator[Match]:
         return iter(self._matches)
-
-    @property
-    def class_name(self) -> NDArray[np.object_]:
-        """Names, None where there is no landmark; (n,)."""
-        return np.array([match.class_name for match in self], dtype=object)
-
-    @property
-    def accepted(self) -> NDArray[np.bool_]:
-        """Whether each match passed its test; (n,)."""
-        return np.array([match.accepted for match in self], dtype=np.bool_)
-
-    @property
-    def reason(self) -> NDArray[np.object_]:
-        """Why each answer is refused, empty where it is accepted; (n,)."""
-        return np.array([match.reason for match in self], dtype=object)
-
-    @property
-    def dof(self) -> NDArray[np.int64]:
-        """Degrees of freedom; (n,)."""
-        return np.array([match.dof for match in self], dtype=np.int64)
-
-    @property
-    def distance_m(self) -> NDArray[np.float64]:
-        """Distances; (n,)."""
-        return self._floats("distance_m")
-
-    @property
-    def delta_rad(self) -> NDArray[np.float64]:
-        """Angles δ; (n,)."""
-        return self._floats("delta_rad")
-
-    @property
-    def bearing_rad(self) -> NDArray[np.float64]:
-        """Bearings; (n,)."""
-        return self._floats("bearing_rad")
-
-    @property
-    def height_m(self) -> NDArray[np.float64]:
-        """Heights; (n,)."""
-        return self._floats("height_m")
-
-    @property
-    def pitch_rad(self) -> NDArray[np.float64]:
-        """Pitch angles of the camera; (n,)."""
-        return self._floats("pitch_rad")
-
-    @property
-    def roll_rad(self) -> NDArray[np.float64]:
-        """Roll angles of the camera; (n,)."""
-        return self._floats("roll_rad")
-
-    @property
-    def chi2(self) -> NDArray[np.float64]:
-        """Whitened squared residuals; (n,)."""
-        return self._floats("chi2")
-
-    @property
-    def p_value(self) -> NDArray[np.float64]:
-        """Probabilities of a larger χ²; (n,)."""
-        return self._floats("p_value")
-
-    @property
-    def condition_number(self) -> NDArray[np.float64]:
-        """Condition of the information in the free parameters; (n,)."""
-        return self._floats("condition_number")
 
     @property
     def covariance(self) -> NDArray[np.float64] | None:
@@ -376,6 +354,3 @@ class Matches(Sequence[Match]):
         caption = f"{len(self)} matches" + (f", the first {_MOST_SHOWN}" if len(self) > _MOST_SHOWN else "")
         rows = [(k, *_cells(match)) for k, match in enumerate(self[:_MOST_SHOWN])]
         return table_html(("position", *_COLUMNS), rows, caption=caption)
-
-    def _floats(self, name: str) -> NDArray[np.float64]:
-        return np.array([getattr(match, name) for match in self], dtype=np.float64)
