@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
@@ -267,7 +268,8 @@ class Matcher:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle a matcher as what it was made from."""
-        return _matcher, self._made_from
+        bank, method, arguments = self._made_from
+        return functools.partial(Matcher, bank, method, **arguments), ()
 
     @property
     def table_bytes(self) -> int:
@@ -428,7 +430,3 @@ def _check_word(name: str, value: object, words: tuple[str, ...], before: str = 
     if not isinstance(value, str) or value not in words:
         shown = repr(value) if isinstance(value, str) else type(value).__name__
         raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")
-
-
-def _matcher(bank: Bank, method: str, arguments: dict[str, Any]) -> Matcher:
-    return Matcher(bank, method, **arguments)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
@@ -217,86 +217,23 @@ def _are_apart(match: Match, other: Candidate) -> bool:
 def _remedy(change: Change) -> str:
     """Return what to do, with the names of the library."""
     value = change.value
-    if change.parameter == "method":
-        return "method='refine'"
-    if change.parameter in ("on", "free", "background"):
-        return f"{change.parameter}={value!r}"
-    if change.parameter in ("flip_h", "flip_v"):
-        return f"{change.parameter} the other way round"
-    if change.parameter == "rotate":
-        return f"rotate by {value}° more"
-    if change.parameter == "quantity":
-        return f"quantity={value!r}"
-    if change.parameter == "unit_factor":
-        return f"a unit {value:g} times as large"
-    if change.parameter == "half_angle_deg":
-        return f"a bank of a sensor with half_angle_h_deg={value[0]:.4g}, half_angle_v_deg={value[1]:.4g}"
-    if change.parameter == "bearing_offset_deg":
-        return f"a bank of a sensor with bearing_offset_deg={value:.3g}"
+    match change.parameter:
+        case "method" | "on" | "free" | "background" | "quantity":
+            return f"{change.parameter}={value!r}"
+        case "flip_h" | "flip_v":
+            return f"{change.parameter} the other way round"
+        case "rotate":
+            return f"rotate by {value}° more"
+        case "unit_factor":
+            return f"a unit {value:g} times as large"
+        case "half_angle_deg":
+            return f"a bank of a sensor with half_angle_h_deg={value[0]:.4g}, half_angle_v_deg={value[1]:.4g}"
+        case "bearing_offset_deg":
+            return f"a bank of a sensor with bearing_offset_deg={value:.3g}"
     return f"a bank with distances to {value:.3g} m"
 
 
 _Behind = Background | Literal["auto", "unknown"] | None
-
-
-@dataclass(frozen=True, eq=False)
-class _Setup:
-    """Settings of a matcher that are needed to build another one like it.
-
-    Parameters
-    ----------
-    nearest : bool
-    free : tuple of str
-        What is estimated; None of `default` stands for it where their priors count.
-    default : tuple of str or None
-    background : Background, "auto", "unknown" or None
-    options : mapping
-    is_default : bool
-        Whether the matcher frees what one frees by itself.
-    """
-
-    nearest: bool
-    free: tuple[str, ...]
-    default: tuple[str, ...] | None
-    background: _Behind
-    options: Mapping[str, Any]
-    is_default: bool = False
-
-    @classmethod
-    def of(cls, matcher: Matcher, background: Background | None) -> _Setup:
-        """Copy the options of a matcher; only this function knows them all."""
-        told = matcher.options
-        if matcher.method == "nearest":
-            return cls(True, VIEW, None, background, {"false_alarm": matcher.false_alarm})
-        options = {
-            "false_alarm": matcher.false_alarm,
-            "on": told["on"] if len(matcher.bank.sensor.frequencies_hz) == 1 else "ranges",
-            "pixels": told["pixels"],
-            "robust": told["robust"],
-        }
-        # before unknown things was tried last of all: the fits before that tell more
-        behind: _Behind = "auto" if told["background"] == "any" else told["background"]
-        if told["on"] == "reported":
-            behind = "unknown"
-        default = matcher.free if behind == "unknown" and told["free"] is None else None
-        # elsewhere a bearing with a prior is searched again without one
-        free = default or (VIEW if told["free"] is None else check_free(told["free"]))
-        return cls(False, free, default, behind, options, told["free"] is None)
-
-    @property
-    def among_unknown(self) -> bool:
-        """Whether unknown things may stand in view, which a rough fit takes for parts of the landmark."""
-        return self.background == "unknown"
-
-    @property
-    def bearing_is_free(self) -> bool:
-        """Whether the bearing is estimated without a prior."""
-        return "bearing_rad" in self.free and self.default is None
-
-    def matcher(self, bank: Bank, free: Sequence[str] | None, background: _Behind, **options: Any) -> Matcher:
-        """Build a matcher like it by maximum likelihood."""
-        told = None if free == self.default else free
-        return Matcher(bank, "refine", free=told, background=background, **{**self.options, **options})
 
 
 def diagnose(
@@ -353,17 +290,13 @@ def diagnose(
     if refused.accepted:
         raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
     n_returned = int((frame.state == PixelState.RETURN).sum())
-    setup = _Setup.of(matcher, background)
-    nothing = Diagnosis(index, refused, n_returned=n_returned, among_unknown=setup.among_unknown)
+    among_unknown = matcher.options["background"] == "unknown" or matcher.options["on"] == "reported"
+    nothing = Diagnosis(index, refused, n_returned=n_returned, among_unknown=among_unknown)
     end = time.monotonic() + seconds
     if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
         return nothing
-    bank, frame = matcher.bank, frame.without_offset()
-    if len(frames.sensor.frequencies_hz) > 1:
-        bank = OneFrequencyBank(bank, "combined")
-        frame = bank.one.frames(frame)
     with ExitStack() as stack:
-        trials = _Trials(bank, setup, frame, refused, stack)
+        trials = _Trials(matcher, frame, background, refused, stack)
         for found in trials.in_order():
             if found:
                 (changes, match), *others = found
@@ -378,23 +311,56 @@ _Found = list[tuple[tuple[Change, ...], Match]]
 
 
 class _Trials:
-    """The changes tried on one frame."""
+    """The changes tried on one frame, by matchers that have the settings of the one that refused it."""
 
-    def __init__(self, bank: Bank, setup: _Setup, frame: FilteredFrames, refused: Match, stack: ExitStack) -> None:
-        self.bank, self.setup, self.frame, self.stack = bank, setup, frame, stack
-        self.search = Search(bank)
-        self.plain = setup.matcher(bank, setup.free, setup.background)
-        self.reference = self.plain.match(frame)[0] if setup.nearest else refused
-        self.bearing_free = setup.bearing_is_free
-        self.with_bearing = check_free(tuple(dict.fromkeys((*setup.free, "bearing_rad"))))
-        self.stated = self._estimated() if isinstance(setup.background, str) else setup.background
+    def __init__(
+        self,
+        matcher: Matcher,
+        frame: FilteredFrames,
+        background: Background | None,
+        refused: Match,
+        stack: ExitStack,
+    ) -> None:
+        told = matcher.options
+        self.nearest, self.stack = matcher.method == "nearest", stack
+        self.bank, self.frame = matcher.bank, frame.without_offset()
+        if len(frame.sensor.frequencies_hz) > 1:
+            self.bank = OneFrequencyBank(self.bank, "combined")
+            self.frame = self.bank.one.frames(self.frame)
+        self.options: dict[str, Any] = {"false_alarm": matcher.false_alarm}
+        self.background: _Behind = background
+        if not self.nearest:
+            on = told["on"] if self.bank is matcher.bank else "ranges"
+            self.options |= {"on": on, "pixels": told["pixels"], "robust": told["robust"]}
+            # before unknown things was tried last of all: the fits before that tell more
+            self.background = "auto" if told["background"] == "any" else told["background"]
+            if on == "reported":
+                self.background = "unknown"
+        self.on_ranges = self.options.get("on", "ranges") == "ranges"
+        self.is_default = not self.nearest and told["free"] is None
+        self.default = matcher.free if self.background == "unknown" and self.is_default else None
+        # elsewhere a bearing with a prior is searched again without one
+        self.free = self.default or (VIEW if told["free"] is None else check_free(told["free"]))
+        self.search = Search(self.bank)
+        self.plain = self.matcher(self.free, self.background)
+        self.reference = self.plain.match(self.frame)[0] if self.nearest else refused
+        self.bearing_free = "bearing_rad" in self.free and self.default is None
+        self.with_bearing = check_free(tuple(dict.fromkeys((*self.free, "bearing_rad"))))
+        self.stated = self._estimated() if isinstance(self.background, str) else self.background
         assert self.stated is None or isinstance(self.stated, Background)
+
+    def matcher(
+        self, free: Sequence[str] | None, background: _Behind, bank: Bank | None = None, **options: Any
+    ) -> Matcher:
+        """Build a matcher by maximum likelihood; free parameters that are free by default have their priors."""
+        told = None if free == self.default else free
+        return Matcher(bank or self.bank, "refine", free=told, background=background, **{**self.options, **options})
 
     def in_order(self) -> Iterator[_Found]:
         """Try changes, the cheapest first; yield those that make the frame fit, usually none."""
-        if self.setup.nearest and self.reference.accepted:
+        if self.nearest and self.reference.accepted:
             yield [((_METHOD,), self.reference)]
-        if self.setup.among_unknown:
+        if self.background == "unknown":
             yield self._freed(("bearing_rad",))
             yield self._transformed()
             yield self._outside_among_unknown()
@@ -403,7 +369,7 @@ class _Trials:
         rough = self._rough(self.frame, self.stated)
         outside = rough is not None and not self._inside(rough.distance_m)
         if not self.bearing_free and not outside:
-            yield self._bearing(rough, self.frame, self.setup.background, ())
+            yield self._bearing(rough, self.frame, self.background, ())
         yield self._other_background()
         yield self._reported()
         yield self._transformed()
@@ -416,40 +382,40 @@ class _Trials:
 
     def _freed(self, names: Sequence[str]) -> _Found:
         """Match with more of the view free."""
-        free = check_free(tuple(dict.fromkeys((*self.setup.free, *names))))
-        if free == self.setup.free and self.setup.default is None:
+        free = check_free(tuple(dict.fromkeys((*self.free, *names))))
+        if free == self.free and self.default is None:
             return []
-        match = self._matched(free, self.setup.background)
-        return [] if match is None else [((_free(match, free, self.setup.free),), match)]
+        match = self._matched(free, self.background)
+        return [] if match is None else [((_free(match, free, self.free),), match)]
 
     def _tilted(self) -> _Found:
         """Match with pitch, roll or height free, or with all of them."""
-        names = [name for name in ("pitch_rad", "roll_rad", "height_m") if name not in self.setup.free]
+        names = [name for name in ("pitch_rad", "roll_rad", "height_m") if name not in self.free]
         single = [found for name in names for found in self._freed((name,))]
         return single or (self._freed(names) if len(names) > 1 else [])
 
     def _reported(self) -> _Found:
         """Match as ranges that a chip reports, where the sensor is one and zones may see a background too."""
-        if self.bank.sensor.histogram is None or self.setup.options.get("on", "ranges") != "ranges":
+        if self.bank.sensor.histogram is None or not self.on_ranges:
             return []
         if (self.frame.state == PixelState.RETURN).mean() < _MIXING:
             return []
         match = Matcher(self.bank, "refine", on="reported", false_alarm=self.plain.false_alarm).match(self.frame)[0]
         change = Change("on", "reported", "ranges as the chip reports them, of the nearest surface of each zone")
-        return [((change,), match)] if self._counts(match) and self._inside(match.distance_m) else []
+        return [((change,), match)] if self._counts(match) else []
 
     def _among_unknown(self) -> _Found:
         """Match among unknown things."""
-        if self.setup.options.get("on", "ranges") != "ranges":
+        if not self.on_ranges:
             return []
-        match = self._matched(self.setup.free, "unknown", robust=False)
+        match = self._matched(self.free, "unknown", robust=False)
         change = Change("background", "unknown", "other things before, beside or behind the landmark")
         return [] if match is None else [((change,), match)]
 
     def _matched(self, free: Sequence[str], background: _Behind, **options: Any) -> Match | None:
         """Match with other settings; None if it is refused or outside the bank."""
-        match = self.setup.matcher(self.bank, free, background, **options).match(self.frame)[0]
-        return match if self._counts(match) and self._inside(match.distance_m) else None
+        match = self.matcher(free, background, **options).match(self.frame)[0]
+        return match if self._counts(match) else None
 
     def _bearing(
         self,
@@ -461,9 +427,9 @@ class _Trials:
         """Match a frame with the bearing free, where a rough fit promises something."""
         if rough is None:
             return []
-        match = self.setup.matcher(self.bank, self.with_bearing, background).match(frame)[0]
-        if self._counts(match) and self._inside(match.distance_m):
-            return [((*before, _free(match, self.with_bearing, self.setup.free)), match)]
+        match = self.matcher(self.with_bearing, background).match(frame)[0]
+        if self._counts(match):
+            return [((*before, _free(match, self.with_bearing, self.free)), match)]
         # the matcher's own search of bearings may miss what a camera stated to look there finds
         sensor = self._turned(rough)
         turned = self._match_window(rough, frame, sensor, self.with_bearing, background)
@@ -478,10 +444,10 @@ class _Trials:
     def _other_background(self) -> _Found:
         """Match with wall and floor estimated, or with none where some were stated."""
         tried: list[tuple[_Behind, Background | None]] = []
-        if isinstance(self.setup.background, Background):
+        if isinstance(self.background, Background):
             tried.append((None, None))
         estimated = self._estimated()
-        if self.setup.background != "auto" and estimated is not None:
+        if self.background != "auto" and estimated is not None:
             tried.append(("auto", estimated))
         for background, scene in tried:
             rough = self._rough(self.frame, scene)
@@ -498,8 +464,8 @@ class _Trials:
                 stated.append(scene)
             aside = abs(rough.bearing_rad) > CLEARLY_ASIDE_RAD and not self.bearing_free
             for told in () if aside else stated:
-                match = self.setup.matcher(self.bank, self.setup.free, told).match(self.frame)[0]
-                if self._counts(match) and self._inside(match.distance_m):
+                match = self.matcher(self.free, told).match(self.frame)[0]
+                if self._counts(match):
                     return [((_background(told, match.background),), match)]
             for told in () if self.bearing_free else stated:
                 found = self._bearing(rough, self.frame, told, (_background(told, scene),))
@@ -511,17 +477,13 @@ class _Trials:
         """Match the frame as other settings would have read it."""
         changed = list(_transforms(self.frame, self.bank))
         matches = self.plain.match(_joined([frame for _, frame in changed]))
-        return [
-            ((change,), match)
-            for (change, _), match in zip(changed, matches, strict=True)
-            if self._counts(match) and self._inside(match.distance_m)
-        ]
+        return [((change,), match) for (change, _), match in zip(changed, matches, strict=True) if self._counts(match)]
 
     def _transformed_with_bearing(self) -> _Found:
         for change, frame in _transforms(self.frame, self.bank):
             if change.parameter not in ("flip_v", "quantity", "unit_factor") or change.value == "range":
                 continue
-            found = self._bearing(self._rough(frame, self.stated), frame, self.setup.background, (change,))
+            found = self._bearing(self._rough(frame, self.stated), frame, self.background, (change,))
             if found:
                 return found
         return []
@@ -530,15 +492,15 @@ class _Trials:
         """Match before images at distances that the bank does not have."""
         if rough is None or self._inside(rough.distance_m):
             return []
-        for free in dict.fromkeys((self.setup.free, self.with_bearing)):
+        for free in dict.fromkeys((self.free, self.with_bearing)):
             sensor = self._turned(rough) if free == self.with_bearing else self.bank.sensor
-            found = self._match_window(rough, self.frame, sensor, free, self.setup.background)
+            found = self._match_window(rough, self.frame, sensor, free, self.background)
             if found is not None and not self._inside(found.distance_m):
                 change = self._distance(found.distance_m)
-                if free == self.setup.free:
+                if free == self.free:
                     return [((change,), found)]
                 match = self._turned_back(found, sensor)
-                return [((change, _free(match, self.with_bearing, self.setup.free)), match)]
+                return [((change, _free(match, self.with_bearing, self.free)), match)]
         return []
 
     def _outside_among_unknown(self) -> _Found:
@@ -551,8 +513,8 @@ class _Trials:
             wide = self.stack.enter_context(
                 rebuild_bank(self.bank, distance_m=distance_m, delta_deg=np.degrees(self.bank.delta_rad).tolist())
             )
-            match = self.setup.matcher(wide, self.setup.free, self.setup.background).match(self.frame)[0]
-            if self._counts(match) and not self._inside(match.distance_m):
+            match = self.matcher(self.free, self.background, wide).match(self.frame)[0]
+            if self._is_better(match) and not self._inside(match.distance_m):
                 return [((self._distance(match.distance_m),), match)]
         return []
 
@@ -564,13 +526,13 @@ class _Trials:
 
     def _field_of_view(self) -> _Found:
         """Match before images of a camera with another field of view."""
-        aside = self.bearing_free or self.setup.is_default
+        aside = self.bearing_free or self.is_default
         fit = self.search.best(self.frame, self.stated, sizes=SIZES, bearing=aside)
         if fit is None or not _is_promising(fit):
             return []
         sensor = wider(self.bank.sensor, fit.size)
-        free = None if self.setup.is_default else self.setup.free
-        match = self._match_window(fit, self.frame, sensor, free, self.setup.background)
+        free = None if self.is_default else self.free
+        match = self._match_window(fit, self.frame, sensor, free, self.background)
         if match is None or not self._inside(match.distance_m):
             return []
         angles = (sensor.half_angle_h_deg, sensor.half_angle_v_deg)
@@ -604,8 +566,8 @@ class _Trials:
                 sensor=sensor,
             )
             self.stack.enter_context(window)
-            match = self.setup.matcher(window, free, background).match(replace(frame, sensor=sensor))[0]
-            return match if self._counts(match) else None
+            match = self.matcher(free, background, window).match(replace(frame, sensor=sensor))[0]
+            return match if self._is_better(match) else None
         return None
 
     def _turned(self, rough: Fit) -> Sensor:
@@ -619,6 +581,10 @@ class _Trials:
         return replace(match, bearing_rad=match.bearing_rad + turned)
 
     def _counts(self, match: Match) -> bool:
+        """Return whether a match is far better than the refused one, and in the range of the bank."""
+        return self._is_better(match) and self._inside(match.distance_m)
+
+    def _is_better(self, match: Match) -> bool:
         """Return whether a match is accepted, and far better than the refused one."""
         if not match.accepted or match.dof < FEWEST_DOF:
             return False

@@ -6,6 +6,7 @@ damped least squares of the ranges, with a limit on what a single pixel may cost
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -115,7 +116,7 @@ class Search:
             return None
         coarse = seen.with_slack(_SLACKS_M[0])
         free = [0, 1] + ([2] if bearing else []) + ([3] if len(sizes) > 1 else [])
-        rows = self._sensor.lower_rows if self._shared else (0, self._sensor.rows)
+        rows = self._sensor.lower_rows if self._shared else None
         starts: list[tuple[float, int, NDArray[np.float64]]] = []
         for c in range(1 if self._shared else min(len(self._names), _MOST_CLASSES)):
             views = self._grid(c, frame, sizes, bearing, mixed=background is not None)
@@ -128,7 +129,7 @@ class Search:
         whole: list[tuple[float, int, NDArray[np.float64]]] = []
         for c in sorted({c for _, c, _ in starts}):
             views = np.stack([view for _, k, view in starts if k == c])
-            cost = self._costs(c, views, coarse, background, (0, self._sensor.rows))
+            cost = self._costs(c, views, coarse, background)
             whole += [(float(cost[k]), c, views[k]) for k in range(len(views))]
         whole.sort(key=lambda start: start[0])
         whole = [start for start in whole if math.isfinite(start[0])]
@@ -160,16 +161,15 @@ class Search:
         row = min(max(sensor.centre_px[1], 0.0), float(sensor.rows))
         middle = math.atan(float(sensor.tangents(column, row)[0]))
         middle -= math.radians(sensor.bearing_offset_deg)
+        bearings = [middle + aside * per_column for aside in _BEARING_OFFSETS_COLUMNS] if bearing else [0.0]
+        offsets = _MIXED_OFFSETS_M if mixed else _DISTANCE_OFFSETS_M
         vertices = self._renderers[c].topology.vertices
-        grid = []
+        grid: list[tuple[float, ...]] = []
         step = _DELTA_STEP_RAD if len(sizes) == 1 else _WIDE_STEP_RAD
         for delta in np.arange(0.0, delta_period_rad(self._symmetry[c]), step):
             along = vertices[:, 0] * math.cos(delta) + vertices[:, 1] * math.sin(delta)
-            for offset in _MIXED_OFFSETS_M if mixed else _DISTANCE_OFFSETS_M:
-                for size in sizes:
-                    for aside in _BEARING_OFFSETS_COLUMNS if bearing else (0.0,):
-                        b = middle + aside * per_column if bearing else 0.0
-                        grid.append((nearest - float(along.min()) + offset, delta, b, size))
+            first = nearest - float(along.min())
+            grid += [(first + off, delta, b, size) for off, size, b in itertools.product(offsets, sizes, bearings)]
         return np.array(grid)
 
     def _costs(
@@ -178,7 +178,7 @@ class Search:
         views: NDArray[np.float64],
         seen: _Seen,
         background: Background | None,
-        rows: tuple[int, int],
+        rows: tuple[int, int] | None = None,
     ) -> NDArray[np.float64]:
         """Return the cost of every view, infinite where it cannot be rendered."""
         residual, mismatch = self._residuals(c, views, seen, background, rows)
@@ -190,10 +190,10 @@ class Search:
         views: NDArray[np.float64],
         seen: _Seen,
         background: Background | None,
-        rows: tuple[int, int],
+        rows: tuple[int, int] | None = None,
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return normalised residuals, 0 where frame and view cannot be compared, and which pixels contradict it."""
-        first, stop = rows
+        first, stop = rows or (0, self._sensor.rows)
         picked = slice(first * self._sensor.cols, stop * self._sensor.cols)
         pixels = picked.stop - picked.start
         residual = np.full((len(views), pixels), np.inf)
@@ -229,12 +229,11 @@ class Search:
         self, c: int, view: NDArray[np.float64], free: list[int], seen: _Seen, background: Background | None
     ) -> tuple[NDArray[np.float64], float]:
         """Lower the cost by damped least squares (Levenberg–Marquardt)."""
-        rows = (0, self._sensor.rows)
         damping = 1e-2
         cost = math.inf
         for _ in range(_ITERATIONS):
             tried = np.stack([view, *(view + step * np.eye(4)[k] for k, step in enumerate(_STEPS) if k in free)])
-            residual, mismatch = self._residuals(c, tried, seen, background, rows)
+            residual, mismatch = self._residuals(c, tried, seen, background)
             if not np.isfinite(residual).all():
                 break
             cost = float(np.minimum(residual[0] ** 2, MOST_COST).sum() + MOST_COST * mismatch[0].sum())
@@ -254,7 +253,7 @@ class Search:
                 step[free] = -np.linalg.solve(matrix, gradient)
                 steps.append(np.clip(step, *_LONGEST))
             candidates = view + np.stack(steps)
-            costs = self._costs(c, candidates, seen, background, rows)
+            costs = self._costs(c, candidates, seen, background)
             best = int(np.argmin(costs))
             if not costs[best] < cost * (1 - 1e-4):
                 break
