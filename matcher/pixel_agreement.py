@@ -87,6 +87,16 @@ def pixel_mask(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bo
     return mask
 
 
+def beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return which pixels have a neighbour in a mask, left, right, above or below; (n, rows, cols)."""
+    out = np.zeros_like(mask)
+    out[:, 1:] |= mask[:, :-1]
+    out[:, :-1] |= mask[:, 1:]
+    out[:, :, 1:] |= mask[:, :, :-1]
+    out[:, :, :-1] |= mask[:, :, 1:]
+    return out
+
+
 def disagrees(
     returned: NDArray[np.bool_],
     not_returned: NDArray[np.bool_],

@@ -18,6 +18,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, disagrees
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
 DIRECT = preset("vl53l5cx-8x8")
+PLATES = np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2])
 NEAR = tuple(np.round(np.arange(0.6, 0.901, 0.01), 3).tolist())
 
 
@@ -31,6 +32,12 @@ def thin_bank(tmp_path_factory):
 @pytest.fixture(scope="module")
 def panel(thin_bank):
     return thin_bank("panel", "vl53l5cx-8x8")
+
+
+def frames_of(bank, *view, seed, n_frames=1, background=None):
+    """Return the filtered frames of some views of the landmark of a bank."""
+    image = Renderer(bank.mesh(bank.classes[0]), bank.sensor, albedo=0.8).render(*view, background=background)
+    return kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(seed), n_frames=n_frames))
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -80,11 +87,7 @@ def test_an_accepted_answer_on_a_thin_panel_is_right(panel, setting):
 def test_a_plate_that_fills_the_view_may_be_its_front_or_its_back(thin_bank, setting):
     # at 0.6 m the 16 × 16 camera sees nothing of the bracket but its plate, from behind as from the front
     bank = thin_bank("bracket", "pmd-16x16")
-    views = Views.broadcast(np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2]))
-    image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render_views(
-        views, background=None if setting == "bearing" else WALL
-    )
-    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(9), n_frames=1))
+    frames = frames_of(bank, *PLATES, seed=9, background=None if setting == "bearing" else WALL)
     matches = Matcher(bank, "refine", **SETTINGS[setting]).match(frames)
     assert not matches.accepted.any()
     assert set(matches.reason) <= {"ambiguous", "undetermined"}
@@ -93,13 +96,9 @@ def test_a_plate_that_fills_the_view_may_be_its_front_or_its_back(thin_bank, set
 def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_front(tmp_path):
     # the back looks exactly like the front, 0.2 m nearer: from 0.65 m on it is in the bank's range
     bank = bank_of("bracket", "pmd-16x16", tmp_path, distance="0.45:1.25:0.01")
-    true_m, true_rad = np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2])
-    renderer = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8)
-    image = renderer.render_views(Views.broadcast(true_m, true_rad), background=WALL)
-    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(9), n_frames=1))
-    matches = Matcher(bank, "refine", **SETTINGS["fixed"]).match(frames)
+    matches = Matcher(bank, "refine", **SETTINGS["fixed"]).match(frames_of(bank, *PLATES, seed=9, background=WALL))
     assert set(matches.reason) <= {"", "ambiguous", "undetermined"}
-    right = (np.abs(matches.distance_m - true_m) < GROSS_M) & (np.abs(matches.delta_rad - true_rad) < GROSS_RAD)
+    right = (np.abs(matches.distance_m - PLATES[0]) < GROSS_M) & (np.abs(matches.delta_rad - PLATES[1]) < GROSS_RAD)
     assert right[matches.accepted].all()
 
 
@@ -184,8 +183,7 @@ def test_few_returns_among_unknown_things_determine_nothing(panel):
 
 
 def test_few_returns_determine_nothing_where_outliers_are_left_out(panel):
-    image = Renderer(panel.mesh("panel"), panel.sensor, albedo=0.8).render(0.6, 0.1)
-    frames = kalman_filter(capture(image, panel.sensor, rng=np.random.default_rng(2), n_frames=50))
+    frames = frames_of(panel, 0.6, 0.1, seed=2, n_frames=50)
     few = frames.range_m.copy()
     seen = np.flatnonzero(np.isfinite(few))
     few.flat[seen[11:]] = np.nan  # six returns for each of D and δ are 12
@@ -197,8 +195,7 @@ def test_few_returns_determine_nothing_where_outliers_are_left_out(panel):
 
 def test_a_landmark_beside_the_middle_is_matched_by_default_and_refused_where_the_bearing_is_fixed(thin_bank):
     bank = thin_bank("bracket", "pmd-16x16")
-    image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render(1.1, 0.3, np.radians(2.5))
-    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(3), n_frames=20))
+    frames = frames_of(bank, 1.1, 0.3, np.radians(2.5), seed=3, n_frames=20)
     assert Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)[0].reason == "poor fit"
     (match,) = Matcher(bank, "refine").match(frames)
     assert match.free == ("distance_m", "delta_rad", "bearing_rad")
@@ -229,8 +226,7 @@ def test_sides_that_are_the_same_have_the_same_weight(tmp_path):
     grid = ["--distance", "0.75:0.85:0.01", "--delta", "0:360:3", "--symmetry", "1", "--sensor", "vl53l5cx-8x8"]
     assert main([*arguments, *grid, "--out", str(tmp_path / "table.h5")]) == 0
     bank = open_bank(tmp_path / "table.h5")
-    image = Renderer(bank.mesh("table"), bank.sensor, albedo=0.8).render(0.8, 0.3)
-    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(4), n_frames=20))
+    frames = frames_of(bank, 0.8, 0.3, seed=4, n_frames=20)
     (match,) = Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)
     assert match.reason == "ambiguous"
     angles = sorted([match.delta_rad, *(other.delta_rad for other in match.alternatives[:3])])
@@ -241,10 +237,8 @@ def test_sides_that_are_the_same_have_the_same_weight(tmp_path):
 @pytest.mark.parametrize("free", [None, ("distance_m", "delta_rad", "bearing_rad")])
 def test_a_wall_is_estimated_behind_a_landmark_beside_the_middle(free):
     bank = build_bank(BankPlan(classes=("cylinder",), sensor="vl53l5cx-8x8", distance_m=NEAR), workers=1)
-    image = Renderer(bank.mesh("cylinder"), bank.sensor, albedo=0.8).render(
-        0.713, np.radians(33.3), np.radians(3.0), background=Background(wall_m=1.5)
-    )
-    frames = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(4), n_frames=12))
+    view, wall = (0.713, np.radians(33.3), np.radians(3.0)), Background(wall_m=1.5)
+    frames = frames_of(bank, *view, seed=4, n_frames=12, background=wall)
     (match,) = Matcher(bank, "refine", free=free, background="auto").match(frames)
     assert match.accepted
     assert match.distance_m == pytest.approx(0.713, abs=2e-3)

@@ -85,6 +85,7 @@ def test_histograms_and_targets_are_not_matched_before_any_background(bank, on):
         Matcher(bank, "refine", on=on, background="any")
 
 
-def test_the_nearest_image_takes_no_background_from_the_frame(bank):
-    with pytest.raises(UsageError, match="automatic background"):
-        Matcher(bank, "nearest", background="any")
+@pytest.mark.parametrize("options", [{"background": "any"}, {"robust": True}], ids=str)
+def test_options_of_maximum_likelihood_are_refused_with_the_nearest_image(bank, options):
+    with pytest.raises(UsageError, match="automatic background belong to method 'refine'"):
+        Matcher(bank, "nearest", **options)

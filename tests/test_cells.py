@@ -85,7 +85,7 @@ def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path
 
 def costs(cells, seen, k, limit):
     found = np.empty(cells.shape, np.float32)
-    cells.fill_costs(found, cells.prepared(seen), k, 0.0, limit)
+    cells.fill_costs(found, cells.prepared(seen[k : k + 1]), 0.0, limit)
     return found
 
 

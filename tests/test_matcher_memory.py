@@ -8,7 +8,6 @@ import pytest
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.data.bank import bank_file
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.nearest import templates
 from phasemark.render import Background, Renderer, capture
 
 VIEW = ("distance_m", "delta_rad")
@@ -28,7 +27,6 @@ def path(tmp_path_factory):
 
 def small_parts(monkeypatch, n_bytes):
     monkeypatch.setattr(bank_file, "_PART_BYTES", n_bytes)
-    monkeypatch.setattr(templates, "_PIXELS_AT_ONCE", n_bytes // 16)
 
 
 @pytest.mark.parametrize(

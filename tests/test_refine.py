@@ -18,6 +18,7 @@ from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.accuracy.trials import Trials, TrialSetup, noisy_frames, run_trials
 from phasemark.matcher.filters import noise_free
 from phasemark.matcher.filters.filtered_frames import PixelState
+from phasemark.matcher.frequencies import background_of
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.descent import descend
@@ -27,7 +28,6 @@ from phasemark.matcher.likelihood.problem import DescentSettings, Problem
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
-from phasemark.matcher.nearest.bank_minima import SearchOfFrames, Starts
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
 
@@ -155,15 +155,6 @@ def test_on_phasors_the_albedo_does_not_matter(bank):
     assert len(inner) >= 29
     assert np.sqrt((inner**2).mean()) < 1.05 + 3.3 / math.sqrt(4 * len(inner))
     assert trials.accepted.mean() > 0.85  # 99 % minus 3.3 σ of 30
-
-
-def test_a_free_bearing_is_found_with_the_rest(bank, renderers):
-    free = VIEW[:3]
-    matcher = Matcher(bank, "refine", free=free)
-    setup = TrialSetup(free=free, bearing_rad=0.06, distance_m=(0.8, 1.2))
-    trials = run_trials(matcher.match, renderers["cylinder"], "cylinder", setup, 12, np.random.default_rng(5))
-    assert not trials.outlier.any()
-    assert np.sqrt((trials.scaled**2).mean()) < 1.05 + 3.3 / math.sqrt(6 * 12)
 
 
 def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
@@ -324,17 +315,14 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
     np.testing.assert_array_equal(problem.clipped(np.repeat(far, 3, axis=0), np.arange(3))[:, 0], farthest[frame])
     assert problem.some(np.array([1])).clipped(far.copy(), np.arange(1))[0, 0] == farthest[0]
 
-    class Only:
-        def __init__(self, k):
-            self.k = k
-
-        def starts(self, seen, limit, cost_of):
-            return Starts(np.zeros(1, np.int64), np.full(1, self.k), np.zeros((1, 6)), np.zeros(1))
-
-    searches: Any = [Only(0), Only(1)]
-    found = SearchOfFrames(searches, 0.1).of_frames(frame).starts(evidence.seen[frame], np.full(len(frame), 300.0))
-    np.testing.assert_array_equal(found.class_index, frame)
-    np.testing.assert_array_equal(found.frame, [0, 1, 2])
+    method = LikelihoodMatcher(bank, free=VIEW[:2])
+    cells = [method._cells(background_of(bank, wall)) for wall in walls]
+    search = method._search.before(*cells).of_frames(frame)
+    assert [search.cells_of(k) for k in range(3)] == [cells[k] for k in frame]
+    found = search.starts(evidence.seen[frame], np.full(3, 300.0))
+    for k, own in enumerate(frame):
+        alone = method._search.before(cells[own]).starts(evidence.seen[[own]], np.full(1, 300.0))
+        np.testing.assert_array_equal(found.view[found.frame == k], alone.view)
 
 
 def test_fewer_frames_are_matched_together_where_images_are_large(bank, renderers, monkeypatch):
@@ -418,19 +406,6 @@ def test_a_scene_without_a_landmark_is_none(bank, background, scene):
     assert not matches.accepted.any()
     if background is not None or scene == "empty":
         assert all(name is None for name in matches.class_name)
-
-
-def test_a_post_in_the_way_shows_in_the_fit_and_robust_residuals_bear_it(bank, renderers):
-    image = renderers["cylinder"].render(1.0, 0.6)
-    frames = noise_free(image, 50)
-    ranges = frames.range_m.copy()
-    ranges[0, 9:13, 4] -= 0.15  # four pixels of the box hidden
-    hidden = FilteredFrames(ranges, frames.std_m, None, None, frames.state, frames.n_effective, SENSOR)
-    plain = Matcher(bank, "refine").match(hidden)[0]
-    robust = Matcher(bank, "refine", robust=True).match(hidden)[0]
-    assert not plain.accepted
-    assert abs(robust.distance_m - 1.0) < abs(plain.distance_m - 1.0) / 3
-    assert abs(robust.delta_rad - 0.6) < abs(plain.delta_rad - 0.6) / 3
 
 
 def test_a_hidden_column_is_refused_and_robust_residuals_place_the_rest(bank, renderers):
@@ -539,11 +514,6 @@ def test_wrong_options_are_refused_in_one_line(bank, options, message, method):
     with pytest.raises(UsageError, match=message) as error:
         Matcher(bank, **{"method": method, **options})
     assert "\n" not in str(error.value)
-
-
-def test_options_of_refine_are_refused_with_nearest(bank):
-    with pytest.raises(UsageError, match="belong to method 'refine'"):
-        Matcher(bank, "nearest", robust=True)
 
 
 def test_phasors_of_frames_without_amplitude_are_refused(bank):

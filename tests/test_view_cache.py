@@ -1,6 +1,9 @@
-"""Images that frames share: never more than the stated bytes, and the same answers with and without."""
+"""Images that frames share: never more than the stated bytes, and the same answers with and without.
 
-from dataclasses import replace
+Also the ranges of the tuning numbers of the search, one of which are these bytes.
+"""
+
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -83,9 +86,11 @@ def test_answers_do_not_depend_on_the_cache_nor_on_threads(bank):
             np.testing.assert_array_equal(getattr(other, name), getattr(answers[0], name))
 
 
-def test_bytes_below_zero_are_refused():
-    with pytest.raises(UsageError, match="'cache_bytes' must be an integer of at least 0"):
-        replace(SearchPolicy(), cache_bytes=-1)
+@pytest.mark.parametrize("field", [field.name for field in fields(SearchPolicy)])
+def test_a_value_of_the_search_policy_out_of_range_names_its_field(field):
+    for bad in (-1, float("nan"), "2", None, True, (float("inf"),)):
+        with pytest.raises(UsageError, match=f"'policy': '{field}' must be "):
+            replace(SearchPolicy(), **{field: bad})  # type: ignore[arg-type]
 
 
 def test_an_image_does_not_depend_on_what_is_rendered_beside_it_when_a_floor_gives_way(bank):

@@ -49,7 +49,7 @@ class Fits:
         Returns that are compared and not left to unknown things.
     stands_out : bool
         Among unknown things, whether the landmark stands where the model has it
-        (:func:`~phasemark.matcher.likelihood.outline.stands_out`); True elsewhere.
+        (:func:`~phasemark.matcher.likelihood.contradictions.stands_out`); True elsewhere.
     prior : float64
         What the prior adds to the cost; no test of the fit counts it.
     covariance : (m, p, p) float64

@@ -16,14 +16,13 @@ from phasemark.matcher.likelihood.background_estimate import (
     fit_background,
     without_background,
 )
-from phasemark.matcher.likelihood.candidates import fit_views
+from phasemark.matcher.likelihood.descent import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.kinks import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.likelihood.search import are_doubtful, search_views
+from phasemark.matcher.likelihood.search import are_doubtful, fit_views, search_views
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad
@@ -46,10 +45,15 @@ _Standing = tuple[list[Background | None], Fits]
 
 
 class AutoBackground:
-    """Searches frames, each before the background that it shows; many frames at the same time.
+    """Searches n frames, each before the background that it shows; many at the same time.
 
     Parameters
     ----------
+    frames : FilteredFrames
+    evidence : Evidence
+        Of them.
+    bare : (n,) float64
+        Cost of a scene without a landmark.
     setup : Setup
     rendered : RenderedModel
         Renders the landmarks before any background.
@@ -65,49 +69,43 @@ class AutoBackground:
 
     def __init__(
         self,
+        frames: FilteredFrames,
+        evidence: Evidence,
+        bare: NDArray[np.float64],
         setup: Setup,
         rendered: RenderedModel,
         scene: _SceneOf,
         whole_scene: _SceneOf,
         open_scene: Callable[[], Scene],
     ) -> None:
+        self._frames, self._evidence, self._bare, self._n = frames, evidence, bare, len(frames)
         self._setup, self._rendered = setup, rendered
         self._scene, self._whole_scene, self._open_scene = scene, whole_scene, open_scene
 
-    def search(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
-        """Return the background of each frame, and what explains the frames before them.
-
-        Parameters
-        ----------
-        frames : FilteredFrames
-            n frames.
-        evidence : Evidence
-            Of them.
-        bare : (n,) float64
-            Cost of a scene without a landmark.
-        """
+    def search(self) -> _Standing:
+        """Return the background of each frame, and what explains the frames before them."""
         # 1  take what is far for the background, and search without the pixels that see it
-        backgrounds, fits = self._first(frames, evidence, bare)
+        backgrounds, fits = self._first()
         # 2  fit both in turn, where a fit is doubtful, and where pixels that see some of the landmark tell the
         #    height of a floor, or tilts
         entangled = [own is not None and (own.floor_m is not None or self._tilted) for own in backgrounds]
-        which = np.flatnonzero(np.array(entangled) | are_doubtful(self._setup, fits, len(frames)))
-        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        which = np.flatnonzero(np.array(entangled) | are_doubtful(self._setup, fits, self._n))
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
         # 3  search all pixels where that leaves a doubt: what was taken for background may be landmark
         which = self._doubtful(backgrounds, fits)
         few = [which[start : start + _TOGETHER] for start in range(0, len(which), _TOGETHER)]
-        fits = Fits.joined([fits, *(self._searched_together(some, backgrounds, evidence, bare) for some in few)])
+        fits = Fits.joined([fits, *(self._searched_together(some, backgrounds) for some in few)])
         which = self._doubtful(backgrounds, fits)
-        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
         # 4  try other angles of the landmark
         which = self._doubtful(backgrounds, fits)
-        fits = Fits.joined([fits, self._other_angles(which, backgrounds, evidence, fits)])
-        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, evidence, fits)
+        fits = Fits.joined([fits, self._other_angles(which, backgrounds, fits)])
+        backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
         # 5  look how far the answers may be off
         parts = []
         for which in _without_and_with(backgrounds):
-            scene = self._scene(_standing(backgrounds, which))
-            parts.append(_numbered(with_profiles(self._setup, scene, evidence[which], _of_frames(fits, which)), which))
+            scene, some = self._scene(_standing(backgrounds, which)), self._evidence[which]
+            parts.append(_numbered(with_profiles(scene, some, _of_frames(fits, which)), which))
         return backgrounds, Fits.joined(parts)
 
     @property
@@ -118,32 +116,32 @@ class AutoBackground:
     def _doubtful(self, backgrounds: list[Background | None], fits: Fits) -> NDArray[np.int64]:
         """Return the frames before a background whose fits are doubtful."""
         stands = np.array([own is not None for own in backgrounds])
-        return np.flatnonzero(stands & are_doubtful(self._setup, fits, len(backgrounds)))
+        return np.flatnonzero(stands & are_doubtful(self._setup, fits, self._n))
 
-    def _first(self, frames: FilteredFrames, evidence: Evidence, bare: NDArray[np.float64]) -> _Standing:
+    def _first(self) -> _Standing:
         """Return what the far pixels of each frame show, and fits to its other pixels."""
-        around = [self._surroundings(frames, k) for k in range(len(frames))]
+        around = [self._surroundings(k) for k in range(self._n)]
         backgrounds = [own.background for own in around]
         parts = []
         for which in _without_and_with(backgrounds):
-            some = evidence[which]
+            some = self._evidence[which]
             seen, behind = some.seen, _standing(backgrounds, which)
             if behind:
                 seen = without_background(seen, [around[k] for k in which])
-            fits = search_views(self._setup, self._scene(behind), some, seen, bare[which])
+            fits = search_views(self._scene(behind), some, seen, self._bare[which])
             parts.append(_numbered(fits, which))
             doubtful = np.flatnonzero(are_doubtful(self._setup, fits, len(which)))
             if not behind and doubtful.size:  # each pixel at an edge may see a background that none sees alone
                 few, again = some[doubtful], which[doubtful]
-                fits = search_views(self._setup, self._open_scene(), few, few.seen, bare[again])
+                fits = search_views(self._open_scene(), few, few.seen, self._bare[again])
                 parts.append(_numbered(fits, again))
         return backgrounds, Fits.joined(parts)
 
-    def _surroundings(self, frames: FilteredFrames, k: int) -> Surroundings:
+    def _surroundings(self, k: int) -> Surroundings:
         """Return what one frame shows behind the landmark; nothing where that leaves no room for one."""
         setup = self._setup
         known = not setup.bearing_is_free or setup.bearing_has_prior
-        around = estimate_surroundings(frames, k, bearing_known=known, tilt_known=not self._tilted)
+        around = estimate_surroundings(self._frames, k, bearing_known=known, tilt_known=not self._tilted)
         if around.background is not None and not self._leaves_room(around.background):
             return replace(around, background=None)
         return around
@@ -153,21 +151,12 @@ class AutoBackground:
         nearest, farthest = self._rendered.with_background(background).limits()
         return bool(nearest < farthest)
 
-    def _searched_together(
-        self,
-        which: NDArray[np.int64],
-        backgrounds: list[Background | None],
-        evidence: Evidence,
-        bare: NDArray[np.float64],
-    ) -> Fits:
+    def _searched_together(self, which: NDArray[np.int64], backgrounds: list[Background | None]) -> Fits:
         """Search frames with their backgrounds in the images of the bank."""
-        some = evidence[which]
-        scene = self._whole_scene(_standing(backgrounds, which))
-        return _numbered(search_views(self._setup, scene, some, some.seen, bare[which]), which)
+        some, scene = self._evidence[which], self._whole_scene(_standing(backgrounds, which))
+        return _numbered(search_views(scene, some, some.seen, self._bare[which]), which)
 
-    def _other_angles(
-        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
-    ) -> Fits:
+    def _other_angles(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> Fits:
         """Fit frames from their best views turned to other angles; distance and bearing are found more easily."""
         if not which.size:
             return fits[:0]
@@ -178,21 +167,21 @@ class AutoBackground:
         period = np.array([delta_period_rad(self._setup.rules.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
-        scene = self._scene(_standing(backgrounds, which))
-        return _numbered(fit_views(self._setup, scene, evidence[which], replace(own[source], view=view)), which)
+        scene, some = self._scene(_standing(backgrounds, which)), self._evidence[which]
+        return _numbered(fit_views(scene, some, replace(own[source], view=view)), which)
 
     def _with_better_backgrounds(
-        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits
     ) -> _Standing:
         """Fit the backgrounds of some frames and the views before them in turn while that helps.
 
         Where no pixel sees a background alone, walls at some distances behind the landmark are tried.
         """
         stands = np.array([own is not None for own in backgrounds])
-        found = self._in_turn(which[stands[which]], backgrounds, evidence, fits)
+        found = self._in_turn(which[stands[which]], backgrounds, fits)
         without = which[~stands[which]]
         best = best_of_frame(fits)
-        nearest_m = np.zeros(len(backgrounds))
+        nearest_m = np.zeros(self._n)
         nearest_m[fits.frame[best]] = fits.view[best, 0]
         for beyond_m in _WALLS_BEYOND_M:
             if not without.size:
@@ -200,33 +189,30 @@ class AutoBackground:
             tried = list(backgrounds)
             for k in without:
                 tried[k] = Background(wall_m=float(nearest_m[k]) + beyond_m)
-            there = self._in_turn(without, tried, evidence, fits)
-            least, news = (least_of_frame(standing[1], len(backgrounds))[without] for standing in (found, there))
+            there = self._in_turn(without, tried, fits)
+            least, news = (least_of_frame(standing[1], self._n)[without] for standing in (found, there))
             found = _taken(found, there, without[news < least])
-            without = without[are_doubtful(self._setup, found[1], len(backgrounds))[without]]
+            without = without[are_doubtful(self._setup, found[1], self._n)[without]]
         return found
 
-    def _in_turn(
-        self, which: NDArray[np.int64], backgrounds: list[Background | None], evidence: Evidence, fits: Fits
-    ) -> _Standing:
+    def _in_turn(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> _Standing:
         """Fit the background of each frame behind its best view, then the views before it, while that helps."""
-        setup = self._setup
         found: _Standing = backgrounds, fits
         for _ in range(_BACKGROUND_ROUNDS):
-            which, moved, starts = self._moved_backgrounds(which, *found, evidence)
+            which, moved, starts = self._moved_backgrounds(which, *found)
             if not which.size:
                 break
-            some, scene = evidence[which], self._scene(_standing(moved, which))
-            settings = replace(scene.settings(setup), look_beside_rad=CLOSE_BY_RAD)
-            again = refine(scene.final, some, starts.frame, starts.class_index, starts.view, settings)
-            before = least_of_frame(found[1], len(backgrounds))[which]
+            some, scene = self._evidence[which], self._scene(_standing(moved, which))
+            settings = replace(scene.settings(), look_beside_rad=CLOSE_BY_RAD)
+            again = refine(scene.final, some, starts, settings)
+            before = least_of_frame(found[1], self._n)[which]
             now = least_of_frame(again, len(which))
             found = _taken(found, (moved, _numbered(again, which)), which[now < before])
             which = which[now <= before - BETTER_COST]
         return found
 
     def _moved_backgrounds(
-        self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits, evidence: Evidence
+        self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits
     ) -> tuple[NDArray[np.int64], list[Background | None], Fits]:
         """Fit the backgrounds behind the best views of some frames.
 
@@ -248,10 +234,8 @@ class AutoBackground:
             if not own.size or background is None:
                 continue
             best = fits[own[np.argsort(fits.cost[own], kind="stable")][:MOST_REFINED]]
-            class_index, free = int(best.class_index[0]), self._setup.free
-            found, view = fit_background(
-                self._rendered, evidence[k : k + 1], class_index, best.view[0], free, background
-            )
+            one, class_index = self._evidence[k : k + 1], int(best.class_index[0])
+            found, view = fit_background(self._rendered, one, class_index, best.view[0], self._setup.free, background)
             if found == background or not self._leaves_room(found):
                 continue
             best.view[0] = view

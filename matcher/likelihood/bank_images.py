@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
-from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages
 
@@ -35,7 +34,7 @@ _DIM = 0.05
 """Where a neighbour is dimmer than this share of the brightest one, interpolate linearly."""
 
 
-class BankModel:
+class BankModel(ImageModel):
     """Model images interpolated from a bank, bearing and height 0.
 
     Parameters
@@ -43,9 +42,6 @@ class BankModel:
     bank : Bank
         Its grid must be regular, with at least four distances and four angles.
     """
-
-    slopes_are_cheap = True
-    alone = None
 
     def __init__(self, bank: Bank) -> None:
         self._sensor = bank.sensor
@@ -55,13 +51,12 @@ class BankModel:
         self._distance, self._delta = bank.distance_m, bank.delta_rad
         self._period = closing_period(bank.delta_rad)
         if bank.full is not None:
-            self._lower = Stack.of(_read(bank.full))
-            self._upper = Stack.of(np.zeros((len(bank.classes), len(self._distance), 4, 0), np.float32))
+            whole = _read(bank.full)
+            self._stacks = Stack.of(whole[:, :, :1, :, :0].copy()), Stack.of(whole)
         else:
             assert bank.lower is not None
             assert bank.upper is not None
-            self._lower = Stack.of(_read(bank.lower)[None])
-            self._upper = Stack.of(_read(bank.upper))
+            self._stacks = Stack.of(_read(bank.upper)[:, :, None]), Stack.of(_read(bank.lower)[None])
 
     def before(self, behind: PhasorImages | None) -> BankModel:
         """Return the same model before another background: an image of it is composed with the landmark's.
@@ -105,49 +100,18 @@ class BankModel:
         phasor, shade = np.zeros((m, pixels), np.complex128), np.zeros((m, 2, pixels))
         slope = np.zeros((m, 2 if free else 0, pixels), np.complex128)
         frame = np.zeros(m, np.int64) if self._frame is None else self._frame
-        interpolate(
-            class_index, view, *self._grid(), self._upper, self._lower, *self._behind, frame, phasor, slope, shade
-        )
+        interpolate(class_index, view, *self._grid(), self._stacks, *self._behind, frame, phasor, slope, shade)
         order = [VIEW.index(name) for name in free]
         picked = slope if order == list(range(slope.shape[1])) else slope[:, order]
         return ModelImages(phasor, picked, shade[:, 0], shade[:, 1])
 
-    def first_images(
-        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
-    ) -> ModelImages:
-        """Interpolate; nothing is kept."""
-        return self.images(class_index, view, free)
-
-    def wide_slopes(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        step: NDArray[np.float64],
-    ) -> None:
-        """Return None: what is interpolated is smooth."""
-
-    def differences(
-        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
-    ) -> NDArray[np.complex128]:
-        """Interpolate both ends."""
-        ends = [
-            [self.images(class_index, view + side * moves[:, k], ()).phasor for side in (1.0, -1.0)]
-            for k in range(moves.shape[1])
-        ]
-        return np.stack([(one - other) / 2 for one, other in ends], axis=1)
-
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
-        """Interpolate images at turned views, and keep the slopes of the views before."""
-        return replace(self.images(class_index, view, ()), slope=like.slope)
-
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels are smooth enough."""
         if not self._smooth_only:
-            return np.ones((len(view), self._sensor.rows * self._sensor.cols), np.bool_)
+            return super().trusted(class_index, view)
         low, high, bend = np.empty((3, len(view), self._sensor.rows * self._sensor.cols))
-        _extremes(class_index, view, *self._grid(), self._upper, self._lower, low, high)
-        _bends(class_index, view, *self._grid(), self._upper, self._lower, bend)
+        _extremes(class_index, view, *self._grid(), self._stacks, low, high)
+        _bends(class_index, view, *self._grid(), self._stacks, bend)
         inside = (high < _FAINT) | (low > 1 - _FAINT) | ((low > _FAINT) & (high < 1 - _FAINT))
         return inside & (bend < _STRAIGHT)
 
@@ -162,12 +126,12 @@ class BankModel:
 
 
 class Stack(NamedTuple):
-    """Images of a bank, whose pixels are ordered so that those that see no landmark come last.
+    """Images of the upper or the lower rows of a bank; pixels that see no landmark come last.
 
     Parameters
     ----------
-    values : (class, D[, δ], 4, pixels) float32
-        Real and imaginary part, intensity and coverage.
+    values : (class, D, δ, 4, pixels) float32
+        Real and imaginary part, intensity and coverage; of one class if all have it, of one δ where all look alike.
     pixel : (pixels,) int64
         Which pixel of the images stands at each place.
     n_lit : (D,) int64
@@ -221,6 +185,13 @@ def _cell(x, n, closes):  # type: ignore[no-untyped-def]
     if not closes:
         first = min(max(first, 0), n - 4)
     return first, x - first - 1.0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _steps_around(angle, first, step, n, closes):  # type: ignore[no-untyped-def]
+    """Return an angle in steps of a grid of n angles, within its period where it closes."""
+    x = (angle - first) / step
+    return x - n * np.floor(x / n) if closes else x
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -342,135 +313,106 @@ def _straight_cell(t):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def interpolate(  # type: ignore[no-untyped-def]
-    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, behind, behind_intensity, frame,
+    class_index, view, first_d, step_d, first_a, step_a, closes, stacks, behind, behind_intensity, frame,
     phasor, slope, shade,
 ):  # fmt: skip
     """Fill phasor, its slopes by D and δ, and intensity with coverage, of m views; what comes in is 0.
 
     `frame` (m,) says which of the backgrounds (k, pixels) each view has.
     """
-    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
-    n_up, n_low = upper.values.shape[-1], lower.values.shape[-1]
+    n_d, n_a = stacks[1].values.shape[1:3]
+    most = max(len(stacks[0].pixel), len(stacks[1].pixel))
     wd, dwd, wa, dwa = np.empty(4), np.empty(4), np.empty(4), np.empty(4)
     once, never = np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(4)
-    lines, cubic = np.empty((4, 8, n_low), np.float32), np.empty((11, n_low), np.float32)
-    lines_up, cubic_up = np.empty((4, 8, n_up), np.float32), np.empty((11, n_up), np.float32)
-    straight, straight_up = np.empty((10, n_low), np.float32), np.empty((10, n_up), np.float32)
+    lines, cubic = np.empty((4, 8, most), np.float32), np.empty((11, most), np.float32)
+    straight = np.empty((10, most), np.float32)
     with_slopes = slope.shape[1] > 0
     for m in range(len(class_index)):
-        c = class_index[m]
-        cl = c if lower.values.shape[0] > 1 else 0
         i0, td = _cell((view[m, 0] - first_d) / step_d, n_d, False)
-        x = (view[m, 1] - first_a) / step_a
-        if closes:
-            x -= n_a * np.floor(x / n_a)
-        j0, ta = _cell(x, n_a, closes)
+        j0, ta = _cell(_steps_around(view[m, 1], first_a, step_a, n_a, closes), n_a, closes)
         _cubic(td, wd, dwd)
         _cubic(ta, wa, dwa)
         dwd /= step_d
         dwa /= step_a
-        j1, j2, j3, j4 = j0 % n_a, (j0 + 1) % n_a, (j0 + 2) % n_a, (j0 + 3) % n_a
-        lit, lit_up = lower.n_lit[i0], upper.n_lit[i0]
-        own, own_intensity = behind[frame[m]], behind_intensity[frame[m]]
-        for a in range(4):
-            block = lower.values[cl, i0 + a]
-            _along_delta(lit, block[j1], block[j2], block[j3], block[j4], wa, dwa, lines[a], with_slopes)
-            if n_up:
-                one = upper.values[c, i0 + a]
-                _along_delta(lit_up, one, one, one, one, once, never, lines_up[a], with_slopes)
-        _along_distance(lit, lines, wd, dwd, cubic, with_slopes)
         k, d = _straight_cell(td)
         kj, a = _straight_cell(ta)
-        near, far = lower.values[cl, i0 + k], lower.values[cl, i0 + k + 1]
-        ja, jb = (j0 + kj) % n_a, (j0 + kj + 1) % n_a
-        _between(lit, near[ja], near[jb], far[ja], far[jb], d, a, step_d, step_a, straight, with_slopes)
-        if n_up:
-            _along_distance(lit_up, lines_up, wd, dwd, cubic_up, with_slopes)
-            near_up, far_up = upper.values[c, i0 + k], upper.values[c, i0 + k + 1]
-            _between(lit_up, near_up, near_up, far_up, far_up, d, 0.0, step_d, step_a, straight_up, with_slopes)
-            _conclude(m, lit_up, upper.pixel, 0, cubic_up, straight_up, own, own_intensity, phasor, slope, shade)
-        _conclude(m, lit, lower.pixel, n_up, cubic, straight, own, own_intensity, phasor, slope, shade)
-
-
-@njit(cache=True, nogil=True)
-def _extremes(  # type: ignore[no-untyped-def]
-    class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, low, high
-):
-    """Fill the least and greatest coverage among the neighbours of m views."""
-    least, most = np.empty(lower.values.shape[-1]), np.empty(lower.values.shape[-1])
-    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
-    n_up = upper.values.shape[-1]
-    for m in range(len(class_index)):
-        c = class_index[m]
-        cl = c if lower.values.shape[0] > 1 else 0
-        i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
-        x = (view[m, 1] - first_a) / step_a
-        if closes:
-            x -= n_a * np.floor(x / n_a)
-        j0, _ = _cell(x, n_a, closes)
-        low[m], high[m] = 0.0, 0.0
-        for q in range(upper.n_lit[i0]):
-            at = upper.pixel[q]
-            low[m, at] = np.inf
-            for a in range(4):
-                cover = upper.values[c, i0 + a, 3, q]
-                low[m, at], high[m, at] = min(low[m, at], cover), max(high[m, at], cover)
-        least[:], most[:] = np.inf, 0.0
-        lit = lower.n_lit[i0]
-        for a in range(4):
+        first = 0
+        for stack in stacks:
+            n, values = stack.n_lit[i0], stack.values[min(class_index[m], len(stack.values) - 1)]
+            own = values.shape[1]
+            w, dw, place = (wa, dwa, a) if own > 1 else (once, never, 0.0)
             for b in range(4):
-                j = (j0 + b) % n_a if closes else j0 + b
-                cover = lower.values[cl, i0 + a, j, 3]
-                for q in range(lit):
-                    least[q], most[q] = min(least[q], cover[q]), max(most[q], cover[q])
-        for q in range(lit):
-            low[m, n_up + lower.pixel[q]], high[m, n_up + lower.pixel[q]] = least[q], most[q]
+                line = values[i0 + b]
+                _along_delta(
+                    n, line[j0 % own], line[(j0 + 1) % own], line[(j0 + 2) % own], line[(j0 + 3) % own], w, dw,
+                    lines[b], with_slopes,
+                )  # fmt: skip
+            _along_distance(n, lines, wd, dwd, cubic, with_slopes)
+            near, far, j, after = values[i0 + k], values[i0 + k + 1], (j0 + kj) % own, (j0 + kj + 1) % own
+            _between(n, near[j], near[after], far[j], far[after], d, place, step_d, step_a, straight, with_slopes)
+            _conclude(
+                m, n, stack.pixel, first, cubic, straight, behind[frame[m]], behind_intensity[frame[m]],
+                phasor, slope, shade,
+            )  # fmt: skip
+            first += len(stack.pixel)
 
 
 @njit(cache=True, nogil=True)
-def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, upper, lower, bend):  # type: ignore[no-untyped-def]
+def _extremes(class_index, view, first_d, step_d, first_a, step_a, closes, stacks, low, high):  # type: ignore[no-untyped-def]
+    """Fill the least and greatest coverage among the neighbours of m views."""
+    n_d, n_a = stacks[1].values.shape[1:3]
+    least, most = np.empty(low.shape[1]), np.empty(low.shape[1])
+    for m in range(len(class_index)):
+        i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
+        j0, _ = _cell(_steps_around(view[m, 1], first_a, step_a, n_a, closes), n_a, closes)
+        low[m], high[m] = 0.0, 0.0
+        first = 0
+        for stack in stacks:
+            values = stack.values[min(class_index[m], len(stack.values) - 1)]
+            least[:], most[:] = np.inf, 0.0
+            for a in range(4):
+                for b in range(min(4, values.shape[1])):
+                    cover = values[i0 + a, (j0 + b) % values.shape[1], 3]
+                    for q in range(stack.n_lit[i0]):
+                        least[q], most[q] = min(least[q], cover[q]), max(most[q], cover[q])
+            for q in range(stack.n_lit[i0]):
+                low[m, first + stack.pixel[q]], high[m, first + stack.pixel[q]] = least[q], most[q]
+            first += len(stack.pixel)
+
+
+@njit(cache=True, nogil=True)
+def _bends(class_index, view, first_d, step_d, first_a, step_a, closes, stacks, bend):  # type: ignore[no-untyped-def]
     """Fill the largest second difference of the intensity among the neighbours of m views, over the brightest pixel.
 
     Along D the intensity times D² is differenced, D in steps, over the D² of the middle.
     """
-    n_d, n_a = lower.values.shape[1], lower.values.shape[2]
-    n_up = upper.values.shape[-1]
-    js, low, up = np.empty(4, np.int64), lower.values, upper.values
+    n_d, n_a = stacks[1].values.shape[1:3]
     nearer, farther = np.empty(3), np.empty(3)
     for m in range(len(class_index)):
-        c = class_index[m]
-        cl = c if lower.values.shape[0] > 1 else 0
         i0, _ = _cell((view[m, 0] - first_d) / step_d, n_d, False)
-        x = (view[m, 1] - first_a) / step_a
-        if closes:
-            x -= n_a * np.floor(x / n_a)
-        j0, _ = _cell(x, n_a, closes)
+        j0, _ = _cell(_steps_around(view[m, 1], first_a, step_a, n_a, closes), n_a, closes)
         for a in range(1, 3):
             middle_d = first_d / step_d + i0 + a
             nearer[a], farther[a] = (1 - 1 / middle_d) ** 2, (1 + 1 / middle_d) ** 2
-        for b in range(4):
-            js[b] = (j0 + b) % n_a if closes else j0 + b
         brightest = 1e-30
         bend[m] = 0.0
-        for q in range(upper.n_lit[i0]):
-            most = 0.0
-            for a in range(1, 3):
-                before, middle, after = up[c, i0 + a - 1, 2, q], up[c, i0 + a, 2, q], up[c, i0 + a + 1, 2, q]
-                brightest = max(brightest, middle)
-                most = max(most, abs(nearer[a] * before - 2 * middle + farther[a] * after))
-            bend[m, upper.pixel[q]] = most
-        for q in range(lower.n_lit[i0]):
-            most = 0.0
-            for a in range(4):
-                for b in range(4):
-                    middle = low[cl, i0 + a, js[b], 2, q]
-                    brightest = max(brightest, middle)
-                    if 0 < a < 3:
-                        ends = nearer[a] * low[cl, i0 + a - 1, js[b], 2, q]
-                        ends += farther[a] * low[cl, i0 + a + 1, js[b], 2, q]
-                        most = max(most, abs(ends - 2 * middle))
-                    if 0 < b < 3:
-                        ends = low[cl, i0 + a, js[b - 1], 2, q] + low[cl, i0 + a, js[b + 1], 2, q]
-                        most = max(most, abs(ends - 2 * middle))
-            bend[m, n_up + lower.pixel[q]] = most
+        first = 0
+        for stack in stacks:
+            values = stack.values[min(class_index[m], len(stack.values) - 1)]
+            own = values.shape[1]
+            for q in range(stack.n_lit[i0]):
+                most = 0.0
+                for a in range(4) if own > 1 else range(1, 3):
+                    for b in range(min(4, own)):
+                        j = (j0 + b) % own
+                        middle = values[i0 + a, j, 2, q]
+                        brightest = max(brightest, middle)
+                        if 0 < a < 3:
+                            ends = nearer[a] * values[i0 + a - 1, j, 2, q] + farther[a] * values[i0 + a + 1, j, 2, q]
+                            most = max(most, abs(ends - 2 * middle))
+                        if 0 < b < 3:
+                            ends = values[i0 + a, (j - 1) % own, 2, q] + values[i0 + a, (j + 1) % own, 2, q]
+                            most = max(most, abs(ends - 2 * middle))
+                bend[m, first + stack.pixel[q]] = most
+            first += len(stack.pixel)
         bend[m] /= brightest

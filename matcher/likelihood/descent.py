@@ -1,11 +1,22 @@
-"""Levenberg–Marquardt for many candidates at once, each with a damping of its own."""
+"""Levenberg–Marquardt for many candidates at once, and lower minima that no slope leads to.
+
+Where an edge of the landmark crosses a pixel's border, slopes jump, and whether the pixel returns changes in a step.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.estimate.fits import BETTER_COST
+from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.contradictions import whole_cost
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, LONGEST_STEP, Problem, State, picked
+from phasemark.matcher.likelihood.residuals import Sums
+from phasemark.matcher.likelihood.uncertainty import capped_axes, view_covariance
 
 SETTLED_COST, ROUGH_COST = 1e-3, 0.1
 """A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as much
@@ -20,6 +31,16 @@ _HOPELESS_DAMPING = 1e5
 _LAST_PROMISE = 100.0
 """A descent ends after a successful step that promised a decrease below this many times `settled`: convergence is
 quadratic."""
+CLOSE_BY_RAD = tuple(math.radians(angle) for angle in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
+"""Offsets of δ at which a solution before a background or on phasors is compared with a parabola."""
+_PARABOLA_SHARE = 0.5
+"""A cost there below this share of the parabola's shows another minimum."""
+_PROMISING_COST = 20.0
+"""What a view beside a solution may cost more and still lead to a better one."""
+_SETTLING_ROUNDS = 3
+"""How often a view that contradicts some pixels is left for a better one nearby."""
+_SETTLING_SIGMA = -5.0, -2.5, -1.5, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 1.5, 2.5, 5.0
+"""Where those are looked for, in standard deviations along the axes of the covariance."""
 
 
 def descend(problem: Problem, state: State, settled: float) -> State:
@@ -93,3 +114,90 @@ def _steps(
     wanted = np.einsum("mpa,mp->ma", axes, gradient * problem.scale) / np.maximum(values, floor[:, None])
     step = np.clip(wanted, -reach[:, None], reach[:, None])
     return np.einsum("mpa,ma->mp", axes, step) * problem.scale, (step != wanted).any(axis=1)
+
+
+def look_beside(problem: Problem, state: State) -> State:
+    """Try δ a little to either side, and descend from where that is promising.
+
+    The other parameters follow by one Gauss–Newton step.
+    """
+    sides = np.array(problem.settings.look_beside_rad)
+    near = np.flatnonzero(state.sums.cost <= problem.limit)
+    if not near.size:
+        return state
+    source = np.repeat(near, len(sides))
+    theta = state.theta[source]
+    turn = VIEW.index("delta_rad")
+    theta[:, turn] += np.tile(sides, len(near))
+    there = problem.some(source).turned(state, source, theta)
+    d = int(np.flatnonzero(problem.columns == turn)[0])
+    others = np.flatnonzero(problem.columns != turn)
+    unit = problem.scale[others]
+    information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
+    gradient = there.sums.gradient[:, others] * unit
+    step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
+    rise = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+    rise -= state.sums.cost[near, None]
+    # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
+    expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state))[near, d][:, None]
+    best = np.argmin(rise - _PARABOLA_SHARE * expected_rise, axis=1)
+    parabola = np.take_along_axis(expected_rise, best[:, None], axis=1)[:, 0]
+    most = np.minimum(_PROMISING_COST, _PARABOLA_SHARE * parabola)
+    chosen = np.flatnonzero(np.take_along_axis(rise, best[:, None], axis=1)[:, 0] < most)
+    if not chosen.size:
+        return state
+    which, at = near[chosen], chosen * len(sides) + best[chosen]
+    theta = theta[at]
+    theta[:, problem.columns[others]] += step[at] * unit
+    theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], which)
+    some = problem.some(which)
+    found = descend(some, some.state(theta, state.use[which]), SETTLED_COST)
+    better = np.flatnonzero(found.sums.cost < state.sums.cost[which])
+    state.update(which[better], picked(found, better))
+    return state
+
+
+def settle(problem: Problem, state: State) -> State:
+    """Move to better views nearby from those that contradict some pixels, and those that cost little more than a rival.
+
+    Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
+    standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.
+    """
+    cost, contradicted = whole_cost(problem, state)
+    near = problem.near_best(state, problem.policy.close_cost)
+    for _ in range(_SETTLING_ROUNDS):
+        near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]))]
+        if not near.size:
+            break
+        moves = _moves(problem, state.sums, near)
+        source = np.repeat(near, moves.shape[1])
+        theta = state.theta[source]
+        theta[:, problem.columns] += moves.reshape(len(source), -1)
+        theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], source)
+        around = problem.around(source)
+        total = whole_cost(around, around.at(theta))[0].reshape(len(near), -1)
+        if problem.settings.around is not None:  # its images cost more by their own error
+            here = problem.around(near)
+            total += (cost[near] - whole_cost(here, here.at(state.theta[near]))[0])[:, None]
+        best = total.argmin(axis=1)
+        chosen = np.flatnonzero(total[np.arange(len(near)), best] < cost[near] - BETTER_COST)
+        if not chosen.size:
+            break
+        at = chosen * moves.shape[1] + best[chosen]
+        near = near[chosen]
+        there = problem.some(near)
+        found = descend(there, there.at(theta[at], with_slopes=True), SETTLED_COST)
+        news, still = whole_cost(there, found)
+        wins = np.flatnonzero(news < cost[near])
+        state.update(near[wins], picked(found, wins))
+        cost[near[wins]], contradicted[near[wins]] = news[wins], still[wins]
+        near = near[wins]
+    return state
+
+
+def _moves(problem: Problem, sums: Sums, which: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return steps along the axes of the covariance, (k, moves, p); where there is none, natural units."""
+    axes = capped_axes(problem, covariance_of(sums.information[which], problem.scale))
+    moves = np.einsum("kpa,s->kasp", axes, np.array(_SETTLING_SIGMA)).reshape(len(which), -1, len(problem.columns))
+    longest = np.abs(moves / problem.scale).max(axis=2, keepdims=True)
+    return np.asarray(moves * np.minimum(1.0, 2.0 / np.maximum(longest, 1e-30)))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Protocol
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,23 +57,24 @@ class ModelImages:
                 own[where] = new
 
 
-class ImageModel(Protocol):
-    """Interface that the refinement needs of an image model.
+class ImageModel(ABC):
+    """Interface that the refinement needs of an image model, with the answers of one that is smooth.
 
-    Parameters
+    Attributes
     ----------
     slopes_are_cheap : bool
         Whether slopes cost no more than images, as those of interpolated images do.
-    alone : ImageModel, optional
-        The same without a background, where what the background returns depends on the view and the landmark's
-        brightness is estimated: images then have `behind`. None elsewhere.
     """
 
-    slopes_are_cheap: bool
+    slopes_are_cheap = True
 
     @property
     def alone(self) -> ImageModel | None:
-        """As an attribute."""
+        """The same without a background, where what that returns depends on the view and the brightness is estimated.
+
+        Images then have `behind`. None elsewhere.
+        """
+        return None
 
     def of_frames(self, frame: NDArray[np.int64]) -> ImageModel:
         """Return the model whose views are those of some frames (m,), each before what stands behind it there.
@@ -80,7 +82,9 @@ class ImageModel(Protocol):
         A model with one background for all frames returns itself, and takes any number of views. One with several
         makes images only after this call, of m views at a time or of parts that are said to it the same way.
         """
+        return self
 
+    @abstractmethod
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Return the images of views (m, 6), columns :data:`VIEW`, of a class each."""
 
@@ -88,26 +92,37 @@ class ImageModel(Protocol):
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
     ) -> ModelImages:
         """Return the same where a search starts, at views that other frames may start from too."""
+        return self.images(class_index, view, free)
 
     def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
         """Return images of views that differ from those of `like` in δ alone, with the slopes of `like`."""
+        return replace(self.images(class_index, view, ()), slope=like.slope)
 
     def wide_slopes(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        step: NDArray[np.float64],
+        self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str], step: NDArray[np.float64]
     ) -> NDArray[np.complex128] | None:
         """Return slopes from differences over `step` (m, p) to either side; None if they differ little from others."""
+        return None
 
     def differences(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
         """Return half the differences of images at both ends of moves (m, k, 6) of views; (m, k, pixels)."""
+        one, other = (
+            np.stack([self.images(class_index, view + side * move, ()).phasor for move in moves.swapaxes(0, 1)], axis=1)
+            for side in (1.0, -1.0)
+        )
+        return np.asarray((one - other) / 2)
 
     def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels of its images may be relied on, (m, pixels)."""
+        """Return which pixels of its images may be relied on, (m, pixels), or (m, 1) where all are alike."""
+        return np.ones((len(view), 1), np.bool_)
 
+    def clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
+        """Move views, in place, to distances that the model can show; `which` of all they are."""
+        nearest, farthest = self.limits()
+        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
+
+    @abstractmethod
     def limits(self) -> tuple[float, float | NDArray[np.float64]]:
         """Return the nearest and the farthest distance it can show, the latter for all views or for each of m."""

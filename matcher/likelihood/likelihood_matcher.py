@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -16,6 +15,7 @@ from scipy import special
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.data.shards.executor import processors
 from phasemark.matcher.chi_squared import largest_costs
 from phasemark.matcher.estimate.acceptance import Rules, rank
 from phasemark.matcher.estimate.fits import Fits
@@ -31,12 +31,11 @@ from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import Scene, Setup, check_free
-from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
 from phasemark.matcher.likelihood.strip_images import StripModel
-from phasemark.matcher.likelihood.systematic import Systematic
+from phasemark.matcher.likelihood.systematic import Systematic, with_motion, with_shared_errors
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
-from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames, Upward
+from phasemark.matcher.nearest.bank_minima import Search, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
@@ -128,7 +127,6 @@ class LikelihoodMatcher:
             prior_std=prior if has_prior or min(prior) < math.inf else (),
             bearing_has_prior=has_prior,
             on=on,
-            background_is_known=self._stated is not None,
             unknown=unknown,
             reports_one_surface=reported,
             used=pixels_of(bank, pixels).ravel(),
@@ -136,17 +134,16 @@ class LikelihoodMatcher:
             widest_rad=policy.prior_sigma * bearing_std_rad if has_prior else math.inf,
             policy=policy,
         )
-        stated = () if self._stated is None else (self._stated,)
         behind = background_of(bank, self._stated) if self._stated is not None else None
         self._search = self._new_search(behind)
-        self._open_search = self._new_search(None, open_edges=True) if self._auto else self._search
+        self._open_search = self._search.before(self._cells(None, open_edges=True)) if self._auto else self._search
         self._exact, self._scout = self._bank_models(behind)
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
             self._check_floor(self._stated.floor_m)
         final = self._exact or self._rendered
-        self._scene = Scene(stated, behind, final, None if self._exact else self._scout, self._search)
+        self._scene = Scene(self._setup, behind, final, None if self._exact else self._scout, self._search)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
@@ -168,22 +165,20 @@ class LikelihoodMatcher:
         """Match frames before the background that was stated, or none."""
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = bare_cost(evidence.seen, self._scene.behind)
-        fits = search_views(self._setup, self._scene, evidence, evidence.seen, bare)
+        fits = search_views(self._scene, evidence, evidence.seen, bare)
         if self._setup.unknown and not self._setup.reports_one_surface:
-            fits = fit_without_borders(self._setup, self._scene, evidence, fits)
-        fits = with_profiles(self._setup, self._scene, evidence, fits)
+            fits = fit_without_borders(self._scene, evidence, fits)
+        fits = with_profiles(self._scene, evidence, fits)
         answers = rank(self._setup.rules, fits, self._doubt(fits), bare, [self._stated] * len(frames))
         answers = self._with_mirror(evidence, answers, self._search)
         return self._with_shared_errors(frames, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames, each before what stands behind it."""
-        auto = AutoBackground(
-            self._setup, self._rendered, self._scene_before, self._whole_scene_before, self._open_scene
-        )
         evidence = Evidence.from_frames(frames, self._setup.on)
         bare = np.minimum(bare_cost(evidence.seen, None), self._bare_wall_cost(evidence))
-        backgrounds, fits = auto.search(frames, evidence, bare)
+        scenes = self._scene_before, self._whole_scene_before, self._open_scene
+        backgrounds, fits = AutoBackground(frames, evidence, bare, self._setup, self._rendered, *scenes).search()
         answers: list[Match] = []
         for k, found in enumerate(rank(self._setup.rules, fits, self._doubt(fits), bare, backgrounds)):
             one, search = slice(k, k + 1), self._search if backgrounds[k] is None else self._open_search
@@ -287,31 +282,28 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.rules.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
-    def _new_search(self, behind: PhasorImages | None, *, open_edges: bool = False) -> Search:
-        """Return a search before some background, over all bearings that are looked for where they are free."""
+    def _cells(self, behind: PhasorImages | None, *, open_edges: bool = False) -> CellBounds:
+        """Return the cells of the bank before some background."""
         setup, bank = self._setup, self._bank
-        stride = (
-            max(1, round(CELL_M / first_step(bank.distance_m))),
-            max(1, round(CELL_RAD / first_step(bank.delta_rad))),
-        )
-        known = setup.height_and_tilt_are_known
-        cells = CellBounds(
+        return CellBounds(
             bank,
-            stride,
+            (max(1, round(CELL_M / first_step(bank.distance_m))), max(1, round(CELL_RAD / first_step(bank.delta_rad)))),
             behind,
             aside=setup.bearing_is_free,
-            upward=not known,
+            upward=not setup.height_and_tilt_are_known,
             open_edges=open_edges,
             turned=self._turned if setup.bearing_is_free else None,
         )
-        layers = layers_of(bank)
-        upward = Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma)
+
+    def _new_search(self, behind: PhasorImages | None) -> Search:
+        """Return a search before some background, over all bearings that are looked for where they are free."""
+        setup, layers = self._setup, layers_of(self._bank)
         return Search(
-            cells,
-            bank.sensor if layers is None else layers.camera,
+            self._cells(behind),
+            self._bank.sensor if layers is None else layers.camera,
             layers,
             setup.widest_rad if setup.bearing_is_free else 0.0,
-            upward,
+            Upward(setup.prior_std_of("height_m"), setup.prior_std_of("pitch_rad"), setup.policy.prior_sigma),
             setup.prior_std_of("bearing_rad") or math.inf,
         )
 
@@ -326,11 +318,10 @@ class LikelihoodMatcher:
         behind = background_of(self._bank, *backgrounds)
 
         def closed_search(k: int) -> Search:
-            return self._new_search(background_of(self._bank, backgrounds[k]))
+            return self._search.before(self._cells(background_of(self._bank, backgrounds[k])))
 
         return replace(
             self._scene,
-            backgrounds=backgrounds,
             behind=behind,
             final=self._rendered.with_background(*backgrounds),
             scout=self._scout.before(behind) if isinstance(self._scout, BankModel) else None,
@@ -340,8 +331,7 @@ class LikelihoodMatcher:
 
     def _whole_scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the same, searched in images of the bank before each background."""
-        searches = [self._new_search(background_of(self._bank, own)) for own in backgrounds]
-        search = SearchOfFrames(searches, self._search.column_rad)
+        search = self._search.before(*(self._cells(background_of(self._bank, own)) for own in backgrounds))
         return replace(self._scene_before(backgrounds), search=search, closed_search=None)
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
@@ -388,4 +378,4 @@ def _check_choices(bank: Bank, background: object, on: str) -> None:
 
 def usual_workers() -> int:
     """Return how many threads match where nobody says: one for each processor, at most eight."""
-    return min(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1, 8)
+    return min(processors(), 8)

@@ -119,7 +119,7 @@ class Problem:
     frame, class_index : (m,) int64
         Which frame each candidate explains, and by which class.
     settings : DescentSettings
-    limit : (m,) float64
+    limit : (m,) float64, optional
         Cost above which a candidate is given up.
     rival : (m,) float64, optional
         Cost of the best explanation of each candidate's frame that is known besides.
@@ -132,10 +132,10 @@ class Problem:
         frame: NDArray[np.int64],
         class_index: NDArray[np.int64],
         settings: DescentSettings,
-        limit: NDArray[np.float64],
+        limit: NDArray[np.float64] | None = None,
         rival: NDArray[np.float64] | None = None,
     ) -> None:
-        self.limit = limit
+        self.limit = np.full(len(frame), np.inf) if limit is None else limit
         self.rival = np.full(len(frame), np.inf) if rival is None else rival
         self.model, self.evidence, self.settings = model.of_frames(frame), evidence, settings
         self.policy = settings.policy
@@ -149,28 +149,23 @@ class Problem:
         known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
         self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
 
-    def some(self, which: NDArray[np.integer]) -> Problem:
-        """Return the problem of some of the candidates."""
-        return self._with(self.model, which)
+    def some(self, which: NDArray[np.integer], model: ImageModel | None = None) -> Problem:
+        """Return the problem of some of the candidates, on the same or another model."""
+        frame, class_index = self.frame[which], self.class_index[which]
+        model = model or self.model
+        return Problem(model, self.evidence, frame, class_index, self.settings, self.limit[which], self.rival[which])
 
     def around(self, which: NDArray[np.integer]) -> Problem:
         """Return the problem of some of the candidates, on what shows the views around solutions."""
-        return self._with(self.settings.around or self.model, which)
+        return self.some(which, self.settings.around)
 
-    def _with(self, model: ImageModel, which: NDArray[np.integer]) -> Problem:
-        return Problem(
-            model,
-            self.evidence,
-            self.frame[which],
-            self.class_index[which],
-            self.settings,
-            self.limit[which],
-            self.rival[which],
-        )
+    def parameters(self, view: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the parameters of views that the model can show, with landmarks as bright as the bank has them."""
+        return np.column_stack([self.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
 
     def start(self, view: NDArray[np.float64]) -> State:
         """Evaluate the first views: the pixels that count, and the brightness of the landmark."""
-        theta = np.column_stack([self.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
+        theta = self.parameters(view)
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         images = self.model.first_images(self.class_index, view, free)
         if self.with_albedo:
@@ -312,8 +307,7 @@ class Problem:
 
     def clipped(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> NDArray[np.float64]:
         """Move views of some candidates, in place, to distances and tilts that the model can show; return them."""
-        nearest, farthest = self.model.limits()
-        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
+        self.model.clip(view, which)
         if self.tilts:
             np.clip(view[:, 4:], -_STEEPEST_RAD, _STEEPEST_RAD, out=view[:, 4:])
         return view

@@ -7,8 +7,9 @@ for; after it, views that contradict pixels are left for better ones nearby.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,9 @@ from numpy.typing import NDArray
 from phasemark.matcher.chi_squared import p_values_of, worse_of_two
 from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.information import covariance_of, eliminated
-from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, whole_cost
-from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend
+from phasemark.matcher.likelihood.contradictions import contradicted_pixels, outlying_pixels, stands_out, whole_cost
+from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend, look_beside, settle
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
-from phasemark.matcher.likelihood.kinks import look_beside, settle
-from phasemark.matcher.likelihood.outline import stands_out
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.uncertainty import (
@@ -30,7 +29,8 @@ from phasemark.matcher.likelihood.uncertainty import (
     std_without_one_pixel,
     view_covariance,
 )
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
+from phasemark.matcher.nearest.bank_minima import Starts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE, beside
 
 _AXIS_ROUNDS = 3
 """How often slopes are differenced along the axes of the covariance, which they make in turn, where height, pitch or
@@ -44,12 +44,26 @@ _VIEWS_AT_ONCE = 512
 """Views whose costs are told together: their images stay in the processor's cache."""
 
 
+class Candidates(Protocol):
+    """Views of m candidates, (m, 6), with the frame that each explains and its class, (m,) int64."""
+
+    @property
+    def frame(self) -> NDArray[np.int64]:
+        """As an attribute."""
+
+    @property
+    def class_index(self) -> NDArray[np.int64]:
+        """As an attribute."""
+
+    @property
+    def view(self) -> NDArray[np.float64]:
+        """As an attribute."""
+
+
 def refine(
     model: ImageModel,
     evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
+    starts: Candidates,
     settings: DescentSettings,
     give_up_above: NDArray[np.float64] | None = None,
     rival: NDArray[np.float64] | None = None,
@@ -62,10 +76,7 @@ def refine(
     ----------
     model : ImageModel
     evidence : Evidence
-    frame, class_index : (m,) int64
-        Which frame each candidate explains, and by which class.
-    view : (m, 6) float64
-        Where it starts, columns :data:`~phasemark.matcher.likelihood.images.VIEW`.
+    starts : Candidates
     settings : DescentSettings
     give_up_above : (m,) float64, optional
         Stop where the cost promises to stay above this.
@@ -80,23 +91,18 @@ def refine(
     Fits
         In the order of the candidates.
     """
-    limit = np.full(len(frame), np.inf) if give_up_above is None else give_up_above
+    infinite = np.full(len(starts.frame), np.inf)
+    limit, rival = (infinite if given is None else given for given in (give_up_above, rival))
     at_once = max(_PIXELS_AT_ONCE // settings.used.size, 1)
-    if roughly and len(frame) > at_once and not model.slopes_are_cheap:
-        none = np.full(len(frame), np.inf) if rival is None else rival
-        parts = [slice(first, first + at_once) for first in range(0, len(frame), at_once)]
-        return Fits.joined(
-            [
-                refine(
-                    model, evidence, frame[own], class_index[own], view[own], settings, limit[own], none[own],
-                    roughly=True,
-                )
-                for own in parts
-            ]
-        )  # fmt: skip
-    problem = Problem(model, evidence, frame, class_index, settings, limit, rival)
-    start = problem.start(view)
-    state = picked(start, np.arange(len(frame)))
+    if roughly and len(infinite) > at_once and not model.slopes_are_cheap:
+        parts = [
+            refine(model, evidence, some, settings, limit[own], rival[own], roughly=True)
+            for own, some in _parts(starts, at_once)
+        ]
+        return Fits.joined(parts)
+    problem = Problem(model, evidence, starts.frame, starts.class_index, settings, limit, rival)
+    start = problem.start(starts.view)
+    state = picked(start, np.arange(len(infinite)))
     state = descend(problem, state, ROUGH_COST) if roughly else _descend_near(problem, state)
     # pixels that did not count at the start may be contradicted at the end
     worse = np.flatnonzero(whole_cost(problem, state)[0] > whole_cost(problem, start)[0])
@@ -111,43 +117,28 @@ def refine(
     return conclude(problem, state)
 
 
+def _parts(starts: Candidates, at_once: int) -> Iterator[tuple[slice, Starts]]:
+    """Yield candidates some at a time, with their places."""
+    for first in range(0, len(starts.frame), at_once):
+        own = slice(first, first + at_once)
+        yield own, Starts(starts.frame[own], starts.class_index[own], starts.view[own])
+
+
 def costs_at(
-    model: ImageModel,
-    evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
-    settings: DescentSettings,
+    model: ImageModel, evidence: Evidence, starts: Candidates, settings: DescentSettings
 ) -> NDArray[np.float64]:
     """Return what m candidates cost where they start, disagreements included; arguments as for :func:`refine`."""
-    parts = [slice(first, first + _VIEWS_AT_ONCE) for first in range(0, len(frame), _VIEWS_AT_ONCE)]
-    costs = [_costs_of_part(model, evidence, frame[own], class_index[own], view[own], settings) for own in parts]
-    return np.concatenate(costs) if costs else np.empty(0)
-
-
-def _costs_of_part(
-    model: ImageModel,
-    evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
-    settings: DescentSettings,
-) -> NDArray[np.float64]:
-    problem = Problem(model, evidence, frame, class_index, settings, np.full(len(frame), np.inf))
-    if problem.with_albedo:  # the brightness of each has to be found first
-        return whole_cost(problem, problem.start(view))[0]
-    theta = np.column_stack([problem.clipped(view.copy(), np.arange(len(view))), np.ones(len(view))])
-    return whole_cost(problem, problem.at(theta))[0]
+    costs = [np.empty(0)]
+    for _, some in _parts(starts, _VIEWS_AT_ONCE):
+        problem = Problem(model, evidence, some.frame, some.class_index, settings)
+        # on phasors the brightness of each has to be found first
+        there = problem.start(some.view) if problem.with_albedo else problem.at(problem.parameters(some.view))
+        costs.append(whole_cost(problem, there)[0])
+    return np.concatenate(costs)
 
 
 def slid(
-    model: ImageModel,
-    evidence: Evidence,
-    frame: NDArray[np.int64],
-    class_index: NDArray[np.int64],
-    view: NDArray[np.float64],
-    settings: DescentSettings,
-    farthest_m: float,
+    model: ImageModel, evidence: Evidence, starts: Candidates, settings: DescentSettings, farthest_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return what m candidates cost at the best distance nearby, and the views there; arguments as for :func:`refine`.
 
@@ -155,12 +146,11 @@ def slid(
     """
     costs, views = [np.empty(0)], [np.empty((0, len(VIEW)))]
     settings = replace(settings, free=VIEW[:1], prior_std=())
-    for first in range(0, len(frame), _VIEWS_AT_ONCE):
-        own = slice(first, first + _VIEWS_AT_ONCE)
-        problem = Problem(model, evidence, frame[own], class_index[own], settings, np.full(len(frame[own]), np.inf))
-        there = view[own].copy()
-        theta = np.column_stack([problem.clipped(there, np.arange(len(there))), np.ones(len(there))])
-        images = model.images(class_index[own], np.ascontiguousarray(there), ())
+    for _, some in _parts(starts, _VIEWS_AT_ONCE):
+        problem = Problem(model, evidence, some.frame, some.class_index, settings)
+        theta = problem.parameters(some.view)
+        there = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN])
+        images = model.images(some.class_index, there, ())
         slope = images.phasor * (1j / evidence.sensor.metres_per_radian)
         state = problem.summed(theta, problem.pixels_at(images, theta), replace(images, slope=slope[:, None]))
         gradient, information = state.sums.gradient[:, 0], state.sums.information[:, 0, 0]
@@ -306,14 +296,7 @@ class _Pixels(NamedTuple):
 
     def among(self, some: NDArray[np.bool_]) -> _Pixels:
         """Return those among some pixels."""
-        return _Pixels(
-            self.compared & some,
-            self.wrong & some,
-            self.undecided & some,
-            self.unexplained & some,
-            self.explained & some,
-            self.stands_out,
-        )
+        return self._replace(**{name: getattr(self, name) & some for name in self._fields if name != "stands_out"})
 
 
 def _further_cost(pixels: _Pixels) -> NDArray[np.float64]:
@@ -361,13 +344,8 @@ def _p_values(
 def _at_edges(problem: Problem, state: State) -> NDArray[np.bool_]:
     """Return which pixels the landmark does not fill, or not all of their neighbours, (m, pixels)."""
     sensor, coverage = problem.evidence.sensor, state.images.coverage
-    filled = (coverage >= FILLED_COVERAGE).reshape(-1, sensor.rows, sensor.cols)
-    inside = filled.copy()
-    inside[:, 1:] &= filled[:, :-1]
-    inside[:, :-1] &= filled[:, 1:]
-    inside[:, :, 1:] &= filled[:, :, :-1]
-    inside[:, :, :-1] &= filled[:, :, 1:]
-    return np.asarray(~inside.reshape(coverage.shape))
+    open_ = (coverage < FILLED_COVERAGE).reshape(-1, sensor.rows, sensor.cols)
+    return np.asarray((open_ | beside(open_)).reshape(coverage.shape))
 
 
 def _judged_pixels(problem: Problem, state: State, near: NDArray[np.intp], covariance: NDArray[np.float64]) -> _Pixels:

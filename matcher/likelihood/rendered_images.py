@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.frequencies import renderer_of
-from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
@@ -27,7 +27,7 @@ _BEYOND_BANK = 1.25
 """Without a wall a view may be this many times as far as the bank's last distance."""
 
 
-class RenderedModel:
+class RenderedModel(ImageModel):
     """Model images rendered where they are needed, from the meshes of a bank.
 
     Parameters
@@ -205,7 +205,7 @@ class RenderedModel:
                 for side in (1.0, -1.0):
                     moved = view[of]
                     moved[:, axis] += side * np.maximum(step[of, k], STEP)
-                    self._clip(moved, of)
+                    self.clip(moved, of)
                     ends.append((moved[:, axis], self._render(c, moved, of, rows).phasor.reshape(len(of), -1)))
                 width = np.maximum(ends[0][0] - ends[1][0], STEP)
                 slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
@@ -221,7 +221,7 @@ class RenderedModel:
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             moved, each = ends[of].reshape(-1, len(VIEW)), np.repeat(of, 2 * k)
-            self._clip(moved, each)
+            self.clip(moved, each)
             phasor[of] = self._render(c, moved, each).phasor.reshape(len(of), 2 * k, -1)
         return np.asarray((phasor[:, :k] - phasor[:, k:]) / 2)
 
@@ -233,15 +233,6 @@ class RenderedModel:
         if self._factored and name == "delta_rad" and not view[:, 3:].any():
             return self.sensor.lower_rows, self.sensor.lower_rows[0] * self.sensor.cols
         return None, 0
-
-    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return that every pixel may be relied on."""
-        return np.ones((len(view), self.sensor.rows * self.sensor.cols), np.bool_)
-
-    def _clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
-        """Move views, in place, to distances at which a landmark may be; `which` of all they are."""
-        nearest, farthest = self.limits()
-        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
 
     def _render_with_slopes(
         self, class_index: int, view: NDArray[np.float64], which: NDArray[np.integer], free: Sequence[str]

@@ -182,6 +182,12 @@ def range_residuals(
     return np.asarray(evidence.sensor.metres_per_radian * np.angle(evidence.value[frame] * phasor.conj()))
 
 
+def range_slopes(phasor: NDArray[np.complex128], slope: NDArray[np.complex128], sensor: Sensor) -> NDArray[np.float64]:
+    """Return how the ranges of model images (m, pixels) change, (m, p, pixels); 0 where they have no light."""
+    turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=phasor != 0)
+    return np.asarray(sensor.metres_per_radian * (slope * turn[:, None]).imag)
+
+
 def robust_weight(
     residual: NDArray[np.float64], weight: NDArray[np.float64], huber: float | None
 ) -> NDArray[np.float64]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,9 @@ from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.likelihood.search_policy import SearchPolicy
 from phasemark.matcher.likelihood.strip_images import StripModel
-from phasemark.matcher.nearest.bank_minima import Search, SearchOfFrames
+from phasemark.matcher.nearest.bank_minima import Search
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.render import Background, PhasorImages
+from phasemark.render import PhasorImages
 
 __all__ = ["Scene", "Setup", "check_free"]
 
@@ -55,8 +55,6 @@ class Setup:
     bearing_has_prior : bool
         Whether the bearing is estimated with what is known of it.
     on : {"ranges", "phasors"}
-    background_is_known : bool
-        Whether a wall or floor was stated.
     unknown : bool
         Whether unknown things may stand in view.
     reports_one_surface : bool
@@ -75,7 +73,6 @@ class Setup:
     prior_std: tuple[float, ...]
     bearing_has_prior: bool
     on: ResidualKind
-    background_is_known: bool
     unknown: bool
     reports_one_surface: bool
     used: NDArray[np.bool_]
@@ -107,14 +104,13 @@ class Setup:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Background with the image models and searches that include it.
+    """Background of a matcher with the image models and searches that include it.
 
     Parameters
     ----------
-    backgrounds : sequence of Background
-        One for all frames, or one for each; empty: nothing stands behind the landmark.
+    setup : Setup
     behind : PhasorImages, optional
-        Their images, without a landmark.
+        Image of the background without a landmark, one for all frames, or one for each; None: nothing is there.
     final : ImageModel
         What the answer is taken from.
     scout : ImageModel, optional
@@ -126,35 +122,33 @@ class Scene:
         leaves it open; None where it does not.
     """
 
-    backgrounds: Sequence[Background]
+    setup: Setup
     behind: PhasorImages | None
     final: ImageModel
     scout: ImageModel | None
-    search: Search | SearchOfFrames
+    search: Search
     closed_search: Callable[[int], Search] | None = None
-
-    def without_scout(self) -> Scene:
-        """Return the scene with images alone that the answer is taken from."""
-        return replace(self, scout=None)
 
     @property
     def strips(self) -> StripModel | None:
         """The scout, if it is made of strips."""
         return self.scout if isinstance(self.scout, StripModel) else None
 
-    def settings(self, setup: Setup) -> DescentSettings:
+    def settings(self) -> DescentSettings:
         """Return how a descent runs before these backgrounds."""
-        behind = self.behind
+        setup, phasor, returns = self.setup, None, None
+        if (behind := self.behind) is not None:
+            shape = len(behind.phasor), -1
+            phasor = behind.phasor.reshape(shape)
+            returns = counts(behind.phasor, behind.intensity, behind.sensor).reshape(shape)
         return DescentSettings(
             setup.free,
             setup.used,
             setup.huber,
-            None if behind is None else behind.phasor.reshape(len(behind.phasor), -1),
+            phasor,
             prior_std=setup.prior_std,
             unknown_around=setup.unknown,
-            returns_behind=None
-            if behind is None
-            else counts(behind.phasor, behind.intensity, behind.sensor).reshape(len(behind.phasor), -1),
+            returns_behind=returns,
             around=self.strips,
             policy=setup.policy,
         )

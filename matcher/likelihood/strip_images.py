@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numba import njit
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.frequencies import OneFrequencyBank
-from phasemark.matcher.likelihood.images import VIEW, ModelImages
+from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
@@ -40,7 +39,7 @@ _Kept = tuple[NDArray[np.int64], NDArray[np.float32]]
 """Places of strips, four for each view, among those that are kept, and these."""
 
 
-class StripModel:
+class StripModel(ImageModel):
     """Model images at any bearing of a level landmark at the bank's height, with nothing behind it.
 
     Parameters
@@ -50,9 +49,6 @@ class StripModel:
     widest_columns : int
         Bearings up to this many columns are asked for.
     """
-
-    slopes_are_cheap = True
-    alone = None
 
     def __init__(self, bank: Bank, widest_columns: int) -> None:
         sensor = bank.sensor
@@ -86,17 +82,9 @@ class StripModel:
         pixels = sensor.rows * _strips_of_column(sensor) * (sensor.cols + 2 * _margin(widest_columns))
         return bool(16 * n_class * max(n_d, 2) * max(n_a, 2) * pixels <= _MOST_BYTES)
 
-    def of_frames(self, frame: NDArray[np.int64]) -> StripModel:
-        """Return the model itself: nothing stands behind the landmark in any frame."""
-        return self
-
     def limits(self) -> tuple[float, float]:
         """Return the bank's first and last distance."""
         return float(self._distance[0]), float(self._distance[-1])
-
-    def trusted(self, class_index: NDArray[np.int64], view: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return that every pixel may be relied on."""
-        return np.ones((len(view), len(self._borders)), np.bool_)
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Interpolate strips and add them up; pitch and roll are not seen, and their slopes are 0."""
@@ -125,31 +113,6 @@ class StripModel:
         slopes = np.zeros((m, len(free), pixels), np.complex128)
         slopes[:, own] = slope[:, [VIEW.index(free[k]) for k in own]]
         return ModelImages(phasor, slopes, shade[:, 0], shade[:, 1])
-
-    first_images = images
-
-    def turned(self, class_index: NDArray[np.int64], view: NDArray[np.float64], like: ModelImages) -> ModelImages:
-        """Return images at turned views, and keep the slopes of the views before."""
-        return replace(self.images(class_index, view, ()), slope=like.slope)
-
-    def wide_slopes(
-        self,
-        class_index: NDArray[np.int64],
-        view: NDArray[np.float64],
-        free: Sequence[str],
-        step: NDArray[np.float64],
-    ) -> None:
-        """Return None: the model is as smooth as its strips."""
-
-    def differences(
-        self, class_index: NDArray[np.int64], view: NDArray[np.float64], moves: NDArray[np.float64]
-    ) -> NDArray[np.complex128]:
-        """Return half the differences of images at both ends."""
-        ends = [
-            [self.images(class_index, view + side * moves[:, k], ()).phasor for side in (1.0, -1.0)]
-            for k in range(moves.shape[1])
-        ]
-        return np.stack([(one - other) / 2 for one, other in ends], axis=1)
 
     def _kept(self, class_index: NDArray[np.int64], corners: NDArray[np.int64]) -> list[_Kept]:
         """Return where the upper and the lower strips at (m, 4, 2) nodes are kept, and render those that are missing.

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
-from phasemark.matcher.likelihood.residuals import range_residuals, robust_weight
+from phasemark.matcher.likelihood.residuals import range_residuals, range_slopes, robust_weight
 
 _SLOPE_WIDTH = 0.05
 """Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this does
@@ -70,8 +70,7 @@ def _influences(problem: Problem, state: State, inverse: NDArray[np.float64]) ->
     use = state.use & problem.settings.used & (weight > 0) & (phasor != 0)
     slope = state.images.slope
     if problem.evidence.on == "ranges":
-        turn = np.divide(1.0, phasor, out=np.zeros_like(phasor), where=use)
-        rows = problem.evidence.sensor.metres_per_radian * (slope * turn[:, None]).imag[..., None]
+        rows = range_slopes(phasor, slope, problem.evidence.sensor)[..., None]
         residual = range_residuals(phasor, problem.evidence, problem.frame)[..., None]
     else:
         difference = problem.evidence.value[problem.frame] - phasor
@@ -96,12 +95,17 @@ def capped_axes(problem: Problem, covariance: NDArray[np.float64]) -> NDArray[np
 
     None is longer than a natural unit; where a covariance is unknown, they are the units themselves.
     """
+    std, vectors = _axes(problem, covariance)
+    return np.asarray(vectors * np.minimum(std, 1.0)[:, None, :] * problem.scale[: covariance.shape[1], None])
+
+
+def _axes(problem: Problem, covariance: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return standard deviations along the axes of covariances, and these, in natural units; units where unknown."""
     p = covariance.shape[1]
     scaled = covariance / np.outer(problem.scale, problem.scale)[:p, :p]
     known = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
     values, vectors = np.linalg.eigh(np.where(known[:, None, None], scaled, np.eye(p)))
-    length = np.minimum(np.sqrt(np.maximum(values, 0.0)), 1.0)
-    return np.asarray(vectors * length[:, None, :] * problem.scale[:p, None])
+    return np.sqrt(np.maximum(values, 0.0)), vectors
 
 
 def slopes_around(
@@ -136,11 +140,8 @@ def slopes_along_axes(
     leave of their sum more than there is: information about what hardly changes the image.
     """
     p = covariance.shape[1]
-    scale = problem.scale[:p]
-    scaled = covariance / np.outer(scale, scale)
-    known = np.asarray(np.isfinite(scaled).all(axis=(1, 2)))
-    values, vectors = np.linalg.eigh(np.where(known[:, None, None], scaled, np.eye(p)))
-    length = np.clip(0.5 * np.sqrt(np.maximum(values, 0.0)), _SLOPE_WIDTH, 1.0)
+    scale, (std, vectors) = problem.scale[:p], _axes(problem, covariance)
+    length = np.clip(0.5 * std, _SLOPE_WIDTH, 1.0)
     moves = np.zeros((len(which), p, len(VIEW)))
     moves[:, :, problem.columns[:p]] = (vectors * length[:, None]).transpose(0, 2, 1) * scale
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])

@@ -10,19 +10,21 @@ from numpy.typing import NDArray
 from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_frame
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
-from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals
+from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
 from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.pixel_agreement import beside
 
 __all__ = ["fit_without_borders"]
 
 
-def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+def fit_without_borders(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Fit the best views again without the pixels beside one that sees something else.
 
     They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. Views of
     one frame are compared on the same pixels: those that are beside something else in none of them. How pixels scatter
     among unknown things is known less well than otherwise: covariances grow with the χ² found.
     """
+    setup = scene.setup
     policy, model = setup.policy, scene.final
     least = least_of_frame(fits, len(evidence.weight))
     close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + policy.margin_cost)
@@ -32,7 +34,7 @@ def fit_without_borders(setup: Setup, scene: Scene, evidence: Evidence, fits: Fi
     kept = np.ones_like(evidence.seen.returned)
     np.logical_and.at(kept, some.frame, _inside(setup, model, evidence, some))
     inside_evidence = replace(evidence, weight=evidence.weight * kept)
-    again = refine(model, inside_evidence, some.frame, some.class_index, some.view, scene.settings(setup))
+    again = refine(model, inside_evidence, some, scene.settings())
     again = again.with_scale(_scatter_of_columns(setup, model, inside_evidence, again))
     others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
     # fits that are not refined again cost less by as much as the best of their frame: its pixels were left out
@@ -53,20 +55,10 @@ def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> 
     shape = (-1, evidence.sensor.rows, evidence.sensor.cols)
     kept = np.ones(other.shape, np.bool_)
     for strange in (other, other | ~returned):  # beside pixels without a return too, where enough are left
-        inside = ~_beside(strange.reshape(shape)).reshape(other.shape) | other
+        inside = ~beside(strange.reshape(shape)).reshape(other.shape) | other
         enough = (inside & returned & ~other).sum(axis=1) >= setup.rules.fewest_explained
         kept[enough] = inside[enough]
     return kept
-
-
-def _beside(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return which pixels have a neighbour in a mask, left, right, above or below; (n, rows, cols)."""
-    out = np.zeros_like(mask)
-    out[:, 1:] |= mask[:, :-1]
-    out[:, :-1] |= mask[:, 1:]
-    out[:, :, 1:] |= mask[:, :, :-1]
-    out[:, :, :-1] |= mask[:, :, 1:]
-    return out
 
 
 def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.float64]:
@@ -77,14 +69,12 @@ def _scatter_of_columns(setup: Setup, model: ImageModel, evidence: Evidence, fit
     """
     rows, cols = evidence.sensor.rows, evidence.sensor.cols
     m, p = len(fits), len(setup.free)
-    strange2 = STRANGE_SIGMA**2
     model = model.of_frames(fits.frame)
     image = model.images(fits.class_index, np.ascontiguousarray(fits.view), setup.free)
-    turn = np.divide(1.0, image.phasor, out=np.zeros_like(image.phasor), where=image.phasor != 0)
-    slope = evidence.sensor.metres_per_radian * (image.slope * turn[:, None]).imag
+    slope = range_slopes(image.phasor, image.slope, evidence.sensor)
     residual = range_residuals(image.phasor, evidence, fits.frame)
     weight = np.where(image.phasor != 0, evidence.weight[fits.frame], 0.0)
-    weight = np.where(weight * residual**2 > strange2, 0.0, weight)
+    weight = np.where(weight * residual**2 > STRANGE_SIGMA**2, 0.0, weight)
     by_column = (m, p, rows, cols)
     weighted = (slope * weight[:, None]).reshape(by_column)
     gradient = np.einsum("mprc,mrc->mcp", weighted, residual.reshape(m, rows, cols))

@@ -7,9 +7,10 @@ shifted in is missing. A return that is shifted out costs 1, the mean of a compa
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -45,37 +46,38 @@ _RAISED = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Starts:
-    """Candidates of n frames; (k,) arrays, those of a frame together, best first.
+    """Candidates of n frames; (k,) arrays.
 
     Parameters
     ----------
     frame, class_index : int64
     view : (k, 6) float64
-    cost : float64
-        Whitened squared distance on the grid.
     """
 
     frame: NDArray[np.int64]
     class_index: NDArray[np.int64]
     view: NDArray[np.float64]
-    cost: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    def __getitem__(self, index: NDArray[Any] | slice) -> Starts:
+        return Starts(self.frame[index], self.class_index[index], self.view[index])
 
     def of_frames(self, frame: NDArray[np.int64]) -> Starts:
         """Return the starts of some frames, which are numbered in their order; `frame` rises."""
-        own = np.isin(self.frame, frame)
-        return Starts(np.searchsorted(frame, self.frame[own]), self.class_index[own], self.view[own], self.cost[own])
+        own = self[np.isin(self.frame, frame)]
+        return replace(own, frame=np.searchsorted(frame, own.frame))
 
     @staticmethod
     def joined(parts: Sequence[Starts]) -> Starts:
         """Return the starts of single frames as those of all."""
-        if not parts:
-            return _NO_STARTS
-        frame = np.repeat(np.arange(len(parts)), [len(own.frame) for own in parts])
-        names = ("class_index", "view", "cost")
-        return Starts(frame, *(np.concatenate([getattr(own, name) for own in parts]) for name in names))
-
-
-_NO_STARTS = Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))), np.empty(0))
+        none = Starts(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, len(VIEW_FIELDS))))
+        frame = np.repeat(np.arange(len(parts)), [len(own) for own in parts])
+        class_index, view = (
+            np.concatenate([getattr(own, name) for own in (none, *parts)]) for name in ("class_index", "view")
+        )
+        return Starts(frame, class_index, view)
 
 
 class Upward(NamedTuple):
@@ -138,6 +140,7 @@ class Search:
         bearing_std_rad: float = math.inf,
     ) -> None:
         self.cells, self._sensor, self._layers = cells, sensor, layers
+        self._of_each: Sequence[CellBounds] = ()
         self._upward, self._bearing_std_rad = upward, bearing_std_rad
         self.column_rad = sensor.pixel_rad
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
@@ -153,9 +156,19 @@ class Search:
         # of the image that is shifted by whole columns: left is positive, and a smaller column
         self._bearing_rad = -np.arctan(np.array(self.shifts)[:, 1] / sensor.columns_per_tangent)
 
+    def before(self, *cells: CellBounds) -> Search:
+        """Return the search before what stands behind all frames, or before that of each, by the cells of the bank."""
+        other = copy.copy(self)
+        other.cells, other._of_each = cells[0], cells[1:] and cells
+        return other
+
     def of_frames(self, frame: NDArray[np.int64]) -> Search:
-        """Return the search for some frames: it is the same for all."""
-        return self
+        """Return the search for some of the frames."""
+        return self.before(*(self._of_each[k] for k in frame)) if self._of_each else self
+
+    def cells_of(self, frame: int) -> CellBounds:
+        """Return the cells of the bank before what stands behind a frame."""
+        return self._of_each[frame] if self._of_each else self.cells
 
     def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
         """Return the local minima among the cells of every frame that may hold an explanation, of each class its own.
@@ -239,7 +252,7 @@ class Search:
         b, i, j = np.concatenate(places).T
         costs = cost[b, c, i, j].astype(np.float64)
         order = np.argsort(costs, kind="stable")
-        return Starts(np.zeros(len(order), np.int64), c[order], self._middles(b, i, j)[order], costs[order])
+        return Starts(np.zeros(len(order), np.int64), c, self._middles(b, i, j))[order]
 
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
@@ -287,12 +300,12 @@ class _Moved:
         self._search = search
         moved = [search.shifted(seen, shift) for shift in search.shifts]
         self._lost = [(seen.returned.sum(axis=1) - own.returned.sum(axis=1)).astype(np.float32) for own in moved]
-        self._prepared = [search.cells.prepared(own) for own in moved]
+        each = range(len(seen.returned))
+        self._prepared = [[search.cells_of(f).prepared(own[f : f + 1]) for f in each] for own in moved]
 
     def costs(self, f: int, limit: float) -> NDArray[np.float32]:
         """Return what a frame costs about the middle of each cell, (shift, class, D, δ), infinite above the limit."""
-        cells = self._search.cells
-        cost = np.empty((len(self._prepared), *cells.shape), np.float32)
+        cost = np.empty((len(self._prepared), *self._search.cells.shape), np.float32)
         for b in range(len(cost)):
             self._fill(cost[b], f, b, limit)
         return cost
@@ -307,54 +320,9 @@ class _Moved:
         return False
 
     def _fill(self, cost: NDArray[np.float32], f: int, b: int, limit: float) -> None:
-        self._search.cells.fill_costs(cost, self._prepared[b], f, self._search.prior(b), limit)
+        search = self._search
+        search.cells_of(f).fill_costs(cost, self._prepared[b][f], search.prior(b), limit)
         cost += self._lost[b][f]
-
-
-class SearchOfFrames:
-    """A first look at a bank before what stands behind each of n frames.
-
-    Parameters
-    ----------
-    searches : sequence of Search
-        One for each frame.
-    column_rad : float
-        Width of a column of the image.
-    """
-
-    def __init__(self, searches: Sequence[Search], column_rad: float) -> None:
-        self._searches, self.column_rad = searches, column_rad
-
-    def of_frames(self, frame: NDArray[np.int64]) -> SearchOfFrames:
-        """Return the search for some of the frames."""
-        return SearchOfFrames([self._searches[k] for k in frame], self.column_rad)
-
-    def starts(self, seen: Observation, limit: NDArray[np.float64], cost_of: CostOf | None = None) -> Starts:
-        """Return the best modes of every frame; see :meth:`Search.starts`."""
-        alone = [(seen[k : k + 1], limit[k : k + 1], _of_one(cost_of, k)) for k in range(len(self._searches))]
-        return Starts.joined([own.starts(*frame) for own, frame in zip(self._searches, alone, strict=True)])
-
-    def uncovered(
-        self,
-        seen: Observation,
-        limit: NDArray[np.float64],
-        known: Sequence[Known],
-        cost_of: CostOf | None = None,
-        slack: float = math.inf,
-    ) -> Starts:
-        """Return views in the cells that are left; see :meth:`Search.uncovered`."""
-        alone = [(slice(k, k + 1), _of_one(cost_of, k)) for k in range(len(self._searches))]
-        return Starts.joined(
-            [
-                own.uncovered(seen[k], limit[k], known[k], cost, slack)
-                for own, (k, cost) in zip(self._searches, alone, strict=True)
-            ]
-        )
-
-
-def _of_one(cost_of: CostOf | None, k: int) -> CostOf | None:
-    """Return the costs of frame `k` as those of the first."""
-    return None if cost_of is None else lambda f, class_index, view: cost_of(f + k, class_index, view)
 
 
 def _least(cost: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -41,7 +41,7 @@ _WIDER = 1.25
 """Factor on the intervals: within a cell, ranges bend."""
 
 
-_Frames = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
+_Frame = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]
 Turned = Callable[[int, float, NDArray[np.float64]], Sequence[PhasorImages]]
 """Returns images of views at some bearings: of a class, at a distance, from angles."""
 
@@ -129,14 +129,12 @@ class CellBounds:
         self.shape = len(bank.classes), len(self.distance_m), len(self.delta_rad)
         self._blocks = _blocks_of(self._pose[0], (-1, *self.shape[1:]), self._period_m)
 
-    def prepared(self, seen: Observation) -> list[_Frames]:
-        """Return frames as the kernels take them, of each group of the bank that is compared."""
+    def prepared(self, seen: Observation) -> list[_Frame]:
+        """Return one frame as the kernels take it, of each group of the bank that is compared."""
         groups = [self._pose] if self._upper is None else [self._pose, self._upper]
         return [_prepared(seen, pixels) for _, pixels in groups]
 
-    def fill_costs(
-        self, out: NDArray[np.float32], frames: Sequence[_Frames], frame: int, before: float, limit: float
-    ) -> None:
+    def fill_costs(self, out: NDArray[np.float32], frame: Sequence[_Frame], before: float, limit: float) -> None:
         """Fill what one frame costs about the middle of each cell, (class, D, δ); infinite where the bound is above.
 
         The intervals count as uniform errors there, so that cells near the best view cost least.
@@ -144,9 +142,8 @@ class CellBounds:
         Parameters
         ----------
         out : float32
-        frames : sequence of _Frames
+        frame : sequence of _Frame
             Of :meth:`prepared`.
-        frame : int
         before : float
             What is known to be added to the cost.
         limit : float
@@ -157,22 +154,16 @@ class CellBounds:
         if self._upper is not None:
             cells = self._upper[0]
             everywhere = np.zeros((len(cells.middle_m), 2), np.float32)
-            y, weight, absent = (part[frame] for part in frames[1])
-            _everywhere(cells, y, weight, absent, period, np.float32(limit), everywhere)
+            _everywhere(cells, *frame[1], period, np.float32(limit), everywhere)
             rest[:] = everywhere.T.reshape(rest.shape)
-        y, weight, absent = (part[frame] for part in frames[0])
-        cells, start, highest = self._pose[0], np.float32(before), np.float32(limit)
-        _scan(self._blocks, cells, y, weight, absent, period, rest, start, highest, out)
+        _scan(self._blocks, self._pose[0], *frame[0], period, rest, np.float32(before), np.float32(limit), out)
 
 
-def _prepared(seen: Observation, pixels: NDArray[np.int64]) -> _Frames:
-    """Return ranges, weights, and what pixels without a return cost where one must be, (frames, pixels)."""
-    weight = np.where(seen.returned[:, pixels], np.maximum(seen.weight[:, pixels], 1e-3), 0.0)
-    absent = np.where(seen.not_returned[:, pixels], DISAGREEMENT, 0.0)
-    ranges, weights, absents = (
-        np.ascontiguousarray(own, np.float32) for own in (seen.range_m[:, pixels], weight, absent)
-    )
-    return ranges, weights, absents
+def _prepared(seen: Observation, pixels: NDArray[np.int64]) -> _Frame:
+    """Return ranges, weights, and what pixels without a return cost where one must be, (pixels,)."""
+    weight = np.where(seen.returned[0, pixels], np.maximum(seen.weight[0, pixels], 1e-3), 0.0)
+    absent = np.where(seen.not_returned[0, pixels], DISAGREEMENT, 0.0)
+    return seen.range_m[0, pixels].astype(np.float32), weight.astype(np.float32), absent.astype(np.float32)
 
 
 def _centres(n: int, stride: int, closes: bool) -> NDArray[np.int64]:

@@ -70,16 +70,11 @@ class NearestMatcher:
         self._false_alarm = false_alarm
         self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
-        if bank.full is not None:
-            self._pose_rows, self._class_rows = (0, bank.sensor.rows), None
-            self.pose = self._templates(bank.full, self._pose_rows)
-            self._class = None
-        else:
-            assert bank.lower is not None
-            assert bank.upper is not None
-            self._pose_rows, self._class_rows = bank.sensor.lower_rows, bank.sensor.upper_rows
-            self.pose = self._templates(bank.lower, self._pose_rows)
-            self._class = self._templates(bank.upper, self._class_rows)
+        whole = bank.full or bank.lower
+        assert whole is not None
+        self._pose_rows = (0, bank.sensor.rows) if bank.full is not None else bank.sensor.lower_rows
+        self.pose = self._templates(whole, self._pose_rows)
+        self._class = None if bank.upper is None else self._templates(bank.upper, bank.sensor.upper_rows)
         self.search = nearest_search(
             self.pose, bank.distance_m, bank.delta_rad, before_background=background is not None
         )
@@ -93,17 +88,13 @@ class NearestMatcher:
         return matches
 
     def _templates(self, group: BankGroup, rows: tuple[int, int]) -> Templates:
-        return Templates.of_group(group, self._bank.sensor, self._behind, rows, wraps=phases_wrap(self._bank))
+        parts = ((some.phasor, some.coverage) for _, some in group.parts())
+        return Templates.of_parts(parts, self._bank.sensor, self._behind, rows, wraps=phases_wrap(self._bank))
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
         pose_seen = Observation.from_frames(frames, self._pose_rows)
-        if self._class is None:
-            class_seen = None
-            found = self._search_full(pose_seen)
-        else:
-            assert self._class_rows is not None
-            class_seen = Observation.from_frames(frames, self._class_rows)
-            found = self._search_factored(pose_seen, class_seen)
+        class_seen = None if self._class is None else Observation.from_frames(frames, self._bank.sensor.upper_rows)
+        found = self._searched(pose_seen, class_seen)
         seen = Observation.from_frames(frames, (0, self._bank.sensor.rows))
         none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
@@ -126,35 +117,25 @@ class NearestMatcher:
             for k in range(len(frames))
         ]
 
-    def _search_factored(self, lower: Observation, upper: Observation) -> _Found:
-        """Find the nearest lower image, then the distance of each class's upper image at that distance."""
-        assert self._class is not None
-        n_class, n_distance = len(self._bank.classes), len(self._bank.distance_m)
-        minima = self.search.minima(lower)
-        best, cost = lowest(*minima)
-        i, j = np.divmod(best, len(self._bank.delta_rad))
-        costs = cost[:, None] + self._class.costs_of_each(upper, np.arange(n_class) * n_distance + i[:, None])
-        return _Found(np.repeat(i[:, None], n_class, axis=1), np.repeat(j[:, None], n_class, axis=1), costs, (minima,))
-
-    def _search_full(self, seen: Observation) -> _Found:
-        """Find the nearest image of each class."""
+    def _searched(self, pose_seen: Observation, class_seen: Observation | None) -> _Found:
+        """Find the nearest image of each class; in a factored bank the nearest lower one, and the upper ones there."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
-        minima = tuple(self.search.minima(seen, c) for c in range(n_class))
+        minima = tuple(self.search.minima(pose_seen, c) for c in range(n_class if class_seen is None else 1))
         nearest = [lowest(*some) for some in minima]
-        best = np.stack([found for found, _ in nearest], axis=1) - np.arange(n_class) * n_distance * n_delta
-        return _Found(*np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1), minima)
+        best = np.stack([found for found, _ in nearest], axis=1) - np.arange(len(minima)) * n_distance * n_delta
+        (i, j), cost = np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1)
+        if class_seen is not None:
+            assert self._class is not None
+            cost = cost + self._class.costs_of_each(class_seen, np.arange(n_class) * n_distance + i)
+            i, j = np.repeat(i, n_class, axis=1), np.repeat(j, n_class, axis=1)
+        return _Found(i, j, cost, minima)
 
     def _nothing(self) -> Templates:
         """Return the one template of a scene without a landmark."""
-        shape = (1, self._bank.sensor.rows, self._bank.sensor.cols)
-        nothing = np.zeros(shape, np.float32)
-        return Templates.build(
-            np.zeros(shape, np.complex64),
-            nothing,
-            self._bank.sensor,
-            self._behind,
-            (0, self._bank.sensor.rows),
-        )
+        sensor = self._bank.sensor
+        shape = 1, sensor.rows, sensor.cols
+        nothing = np.zeros(shape, np.complex64), np.zeros(shape, np.float32)
+        return Templates.of_parts([nothing], sensor, self._behind, (0, sensor.rows))
 
     def _is_ambiguous(
         self,

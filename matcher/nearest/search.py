@@ -9,7 +9,6 @@ that is where it stands; its reach is longer than the ripples. Every cost on the
 from __future__ import annotations
 
 import math
-from typing import Protocol
 
 import numpy as np
 from numba import njit
@@ -29,19 +28,6 @@ _WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
 _N_STARTS = 6
 _LEAST_THINNING = 4
 """A grid that is thinned by less than this is searched whole."""
-
-
-class Nearest(Protocol):
-    """Finds the nearest template of a block of a bank."""
-
-    def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the nearest template of one block to each of n frames, and its distance; (n,) each."""
-
-    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the lowest minima of one block for each of n frames, (n, k), and their distances.
-
-        Some may be the same; where there are fewer, the index is that of the first template and the distance infinite.
-        """
 
 
 class ExactSearch:
@@ -65,30 +51,20 @@ class ExactSearch:
         self._shape = size // (n_delta or 1), n_delta or 1
         self._closes = closes
 
-    def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the nearest template of one block to each of n frames, and its distance; (n,) each."""
-        return self._best(seen, self._costs(seen, block), block)
-
     def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the lowest minima of the grid of one block for each of n frames, (n, k), and their distances."""
-        costs = self._costs(seen, block)
+        """Return the lowest minima of one block for each of n frames, (n, k), and their distances.
+
+        Some may be the same; where there are fewer, the index is that of the first template and the distance infinite.
+        """
+        first = block * self._size
+        costs = self._templates.costs(seen, slice(first, first + self._size))
         found, cost = _minima(costs.reshape(len(costs), 1, *self._shape), _N_STARTS, self._closes)
-        best, least = self._best(seen, costs, block)
+        best, least = np.zeros(len(costs), np.int64), np.zeros(len(costs))
+        for k, row in enumerate(costs):
+            best[k], least[k] = self._templates.best(seen, k, row, offset=first)
         # the costs of all templates are float32 products; the best one is known exactly
         cost = np.maximum(cost, least[:, None])
-        return np.column_stack([best, found + block * self._size]), np.column_stack([least, cost])
-
-    def _costs(self, seen: Observation, block: int) -> NDArray[np.float32]:
-        return self._templates.costs(seen, slice(block * self._size, (block + 1) * self._size))
-
-    def _best(
-        self, seen: Observation, costs: NDArray[np.float32], block: int
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the nearest template of one block to each of n frames, and its exact distance; (n,) each."""
-        found, cost = np.zeros(len(costs), np.int64), np.zeros(len(costs))
-        for k, row in enumerate(costs):
-            found[k], cost[k] = self._templates.best(seen, k, row, offset=block * self._size)
-        return found, cost
+        return np.column_stack([best, found + first]), np.column_stack([least, cost])
 
 
 class PrunedSearch:
@@ -125,16 +101,8 @@ class PrunedSearch:
         block = np.arange(math.prod(self._shape)).reshape(self._shape)[:: stride[0], :: stride[1]].ravel()
         self._thin = [templates[first + block] for first in range(0, len(templates), math.prod(self._shape))]
 
-    def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the lowest template of one block that a descent reaches, and its distance; (n,) each."""
-        return lowest(*self._descended(seen, block))
-
     def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return where the descents end that start at the lowest minima of the thinned grid, (n, k), and the costs."""
-        return self._descended(seen, block)
-
-    def _descended(self, seen: Observation, block: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return where the descents end, and the costs there; (n, k) each."""
         t = self._templates
         shape = len(seen.range_m), 1, len(self._i), len(self._j)
         size = math.prod(self._shape)
@@ -166,7 +134,7 @@ def nearest_search(
     delta_rad: NDArray[np.float64],
     *,
     before_background: bool = False,
-) -> Nearest:
+) -> ExactSearch | PrunedSearch:
     """Return the pruned search where the grid of each block is regular and fine, the exact one elsewhere."""
     steps = _regular_step(distance_m), _regular_step(delta_rad)
     if steps[0] is not None and steps[1] is not None:

@@ -27,7 +27,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
@@ -35,7 +34,6 @@ from phasemark.render.phasor_images import wrap_difference_m
 
 _T = TypeVar("_T", bound=np.generic)
 _RECHECKED = 64
-_PIXELS_AT_ONCE = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,51 +113,6 @@ class Templates:
     wraps: bool = False
 
     @classmethod
-    def build(
-        cls,
-        phasor: NDArray[np.complexfloating],
-        coverage: NDArray[np.floating],
-        sensor: Sensor,
-        background: PhasorImages | None,
-        rows: tuple[int, int],
-        *,
-        wraps: bool = False,
-    ) -> Templates:
-        """Turn model images into templates, composed with a background if there is one.
-
-        Parameters
-        ----------
-        phasor, coverage : (..., rows, cols)
-            What the landmark alone returns.
-        sensor : Sensor
-        background : PhasorImages, optional
-            One image of the background without the landmark; S = S_landmark + (1 − coverage) · S_background.
-        rows : (first, stop)
-            Rows of the sensor that the images hold.
-        wraps : bool
-            As an attribute.
-        """
-        seen = phasor.reshape(-1, *phasor.shape[-2:])
-        cover = np.asarray(coverage).reshape(-1, *seen.shape[1:])
-        at_once = max(_PIXELS_AT_ONCE // math.prod(seen.shape[1:]), 1)
-        some = [slice(first, first + at_once) for first in range(0, len(seen), at_once)]
-        return cls.of_parts(((seen[k], cover[k]) for k in some), sensor, background, rows, wraps=wraps)
-
-    @classmethod
-    def of_group(
-        cls,
-        group: BankGroup,
-        sensor: Sensor,
-        background: PhasorImages | None,
-        rows: tuple[int, int],
-        *,
-        wraps: bool = False,
-    ) -> Templates:
-        """Turn all images of a group of a bank into templates, reading some at a time; see :meth:`build`."""
-        parts = ((some.phasor, some.coverage) for _, some in group.parts())
-        return cls.of_parts(parts, sensor, background, rows, wraps=wraps)
-
-    @classmethod
     def of_parts(
         cls,
         parts: Iterable[tuple[NDArray[np.complexfloating], NDArray[np.floating]]],
@@ -169,9 +122,21 @@ class Templates:
         *,
         wraps: bool = False,
     ) -> Templates:
-        """Turn phasors and coverages that come some images at a time into templates; see :meth:`build`.
+        """Turn model images that come some at a time into templates, composed with a background if there is one.
 
         The answer does not depend on how many come together.
+
+        Parameters
+        ----------
+        parts : iterable of (phasor, coverage), (..., rows, cols) each
+            What the landmark alone returns.
+        sensor : Sensor
+        background : PhasorImages, optional
+            One image of the background without the landmark; S = S_landmark + (1 − coverage) · S_background.
+        rows : (first, stop)
+            Rows of the sensor that the images hold.
+        wraps : bool
+            As an attribute.
         """
         found = [seen_by_images(*part, sensor, background, rows) for part in parts]
         # the circular mean, so that a pixel whose ranges straddle the wrap has its mean there
@@ -210,13 +175,15 @@ class Templates:
         np.square(self.range_m, out=matrix[:, 2])
         return matrix.reshape(len(self), -1)
 
-    def costs(self, seen: Observation, subset: slice | None = None) -> NDArray[np.float32]:
+    def costs(self, seen: Observation, subset: slice = slice(None)) -> NDArray[np.float32]:
         """Return the distances of n frames from all templates (or a slice of them), (n, t), to float32's accuracy."""
         about = self.about(seen)
         if self.wraps:
-            picked = slice(None) if subset is None else subset
-            models = (self.range_m[picked], self.may_return[picked], self.must_return[picked])
-            return self._wrapped_costs(models, about, seen)
+            models = self.range_m[subset], self.may_return[subset], self.must_return[subset]
+            out = np.empty((len(about), len(models[0])), np.float32)
+            frames = about, seen.weight, seen.returned, seen.not_returned
+            _costs_on_a_circle(*models, *frames, self.sensor.unambiguous_range_m, out)
+            return out
         query = np.concatenate(
             [
                 seen.weight * about**2 - DISAGREEMENT * seen.returned,
@@ -226,21 +193,8 @@ class Templates:
             ],
             axis=1,
         )
-        matrix = self.matrix if subset is None else self.matrix[subset]
         constant = DISAGREEMENT * seen.returned.sum(axis=1)
-        return np.asarray(query.astype(np.float32) @ matrix.T + constant[:, None].astype(np.float32))
-
-    def _wrapped_costs(
-        self,
-        models: tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]],
-        about: NDArray[np.float64],
-        seen: Observation,
-    ) -> NDArray[np.float32]:
-        """Return the distances of n frames from t templates whose ranges may differ by more than half a period."""
-        out = np.empty((len(about), len(models[0])), np.float32)
-        period_m = self.sensor.unambiguous_range_m
-        _costs_on_a_circle(*models, about, seen.weight, seen.returned, seen.not_returned, period_m, out)
-        return out
+        return np.asarray(query.astype(np.float32) @ self.matrix[subset].T + constant[:, None].astype(np.float32))
 
     def exact_costs(self, seen: Observation, frame: int, index: NDArray[np.integer]) -> NDArray[np.float64]:
         """Return the distances of one frame from some templates in float64, (t,)."""

@@ -37,6 +37,7 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.statistics import binomial_interval
 from phasemark.render import Background, PhasorImages, Renderer, Views, capture
 
@@ -252,9 +253,9 @@ def costs_of(
         if name is None:
             texts.append("none")
             continue
-        class_index, frame = np.array([matcher.bank.classes.index(name)]), np.zeros(1, np.int64)
-        start = np.array([[*view, 0.0, 0.0, 0.0]])
-        arguments = (scene.final, evidence, frame, class_index, start, scene.settings(setup))
+        class_index = np.array([matcher.bank.classes.index(name)])
+        start = Starts(np.zeros(1, np.int64), class_index, np.array([[*view, 0.0, 0.0, 0.0]]))
+        arguments = (scene.final, evidence, start, scene.settings())
         texts.append(f"{costs_at(*arguments)[0]:.1f} → {refine(*arguments).cost[0]:.1f}")
     return texts
 
