@@ -1,9 +1,11 @@
 """Damaged files of every kind that a command reads, and the commands that read them."""
 
 import os
+import random
 import shutil
 
 import numpy as np
+from programs.fuzzing import mutate
 
 from phasemark.cli import main
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
@@ -68,34 +70,15 @@ def make_good_files(folder):
     }  # fmt: skip
 
 
-def mutate(content, rng):
-    """Flip, cut, repeat or overwrite some of a file."""
-    data = bytearray(content)
-    for _ in range(int(rng.integers(1, 6))):
-        kind, at = rng.integers(4), int(rng.integers(len(data)))
-        # most of what is interpreted lies in the first pages
-        at = at % 4096 % len(data) if rng.random() < 0.7 else at
-        if kind == 0:
-            data[at] ^= 1 << int(rng.integers(8))
-        elif kind == 1:
-            data[at : at + 8] = rng.bytes(8)
-        elif kind == 2:
-            data[at : at + 4] = b"\xff\xff\xff\xff"
-        elif len(data) > 1000:
-            del data[-int(rng.integers(1, len(data) // 2)) :]
-    return bytes(data)
-
-
 def write_mutant(good, path, rng):
     """Write a mutant of a file, or of one file of a folder."""
     if good.is_dir():
         shutil.rmtree(path, ignore_errors=True)
         shutil.copytree(good, path)
         files = sorted(entry for entry in path.iterdir() if entry.is_file())
-        victim = files[int(rng.integers(len(files)))]
-        victim.write_bytes(mutate(victim.read_bytes(), rng))
-    else:
-        path.write_bytes(mutate(good.read_bytes(), rng))
+        good, path = (rng.choice(files),) * 2
+    content = good.read_bytes()
+    path.write_bytes(mutate(content, [content], rng))
 
 
 def busy_seconds():
@@ -122,7 +105,7 @@ def check_mutants(folder, n, seed):
     good, out = folder / "good", folder / "out"
     good.mkdir()
     files = make_good_files(good)
-    rng = np.random.default_rng(seed)
+    rng = random.Random(seed)
     runs, refused, longest = 0, 0, 0.0
     for kind, k in [(each, k) for each, count in n.items() for k in range(count)]:
         path = folder / f"mutant{files[kind].suffix}"

@@ -94,15 +94,6 @@ def test_a_build_killed_at_a_random_moment_resumes_to_the_same_bytes(tmp_path, v
     print(f"before, during and after the file was made: {done.split()[-3:]}")
 
 
-@pytest.mark.soak
-def test_threads_and_dask_make_one_file_whatever_the_workers_and_shards(tmp_path):
-    pytest.importorskip("distributed")
-    lines = run_program("build_on_every_scheduler", tmp_path).splitlines()
-    made = [line.split() for line in lines if line.split()[0] in ("threads", "dask")]
-    assert len(made) == 2 * 4 * 3
-    assert len({line[-1] for line in made}) == 1
-
-
 def test_a_changed_mesh_file_is_noticed_when_resuming(tmp_path):
     from phasemark.landmarks import build_mesh, catalog, export_mesh
 

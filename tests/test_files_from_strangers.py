@@ -13,10 +13,11 @@ import h5py
 import numpy as np
 import pytest
 from damaged_files import COMMANDS, check_mutants
+from programs.regenerate_golden import BANK, FRAMES
 
 from phasemark import InputFileError
 from phasemark.cli import main
-from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_bank, open_frames, read_frames
+from phasemark.data import open_bank, open_frames, read_frames
 from phasemark.data.files.guard import first_reading, refusal
 from phasemark.inputs import checksum_path
 from phasemark.inputs.toml_file import read_toml
@@ -26,20 +27,6 @@ from phasemark.matcher.recordings.pose_table import read_pose_table
 from phasemark.render import preset
 
 SENSOR = preset("pmd-16x16")
-
-
-@pytest.fixture(scope="module")
-def bank_bytes(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bank") / "bank.h5"
-    build_bank(BankPlan(classes=["cone"], distance_m="1", delta_deg="0:90:45", model="planar"), path).close()
-    return path.read_bytes()
-
-
-@pytest.fixture(scope="module")
-def frames_bytes(tmp_path_factory):
-    path = tmp_path_factory.mktemp("frames") / "frames.h5"
-    build_frames(FramePlan(classes=["cone"], views=3, frames_per_view=2), path).close()
-    return path.read_bytes()
 
 
 @pytest.fixture
@@ -148,12 +135,10 @@ def test_what_a_cycle_of_groups_holds_is_looked_at_once(tmp_path):
     assert first_reading(path) is None
 
 
-def test_an_honest_file_passes(tmp_path, bank_bytes, frames_bytes):
-    for content in (bank_bytes, frames_bytes):
-        path = tmp_path / "honest.h5"
-        path.write_bytes(content)
-        assert refusal(path) is None
-        assert first_reading(path) is None
+@pytest.mark.parametrize("path", [BANK, FRAMES])
+def test_an_honest_file_passes(path):
+    assert refusal(path) is None
+    assert first_reading(path) is None
 
 
 def test_filters_of_hdf5_itself_are_read(tmp_path):

@@ -16,7 +16,7 @@ SOAK = {
     "frames": 300,
 }  # fmt: skip
 """Inputs of each kind: 129 400 in all. Kinds of HDF5 are read by a child process first, a fraction of a second each."""
-TOML = [kind for kind, (suffix, _) in fuzzing.KINDS.items() if suffix == ".toml"]
+TOML = [kind for kind, (suffix, *_) in fuzzing.KINDS.items() if suffix == ".toml"]
 SEED = 20261
 
 
@@ -92,7 +92,7 @@ def test_a_reader_that_stumbles_is_found(tmp_path, monkeypatch):
     def stumble(path):
         raise ZeroDivisionError("stumbled")
 
-    monkeypatch.setitem(fuzzing.KINDS, "npy", (".npy", stumble))
+    monkeypatch.setitem(fuzzing.KINDS, "npy", (".npy", stumble, fuzzing.KINDS["npy"][2]))
     found = fuzzing.fuzz("npy", 3, 0, tmp_path)
     assert found["n_found"] == 3
     assert len(list(Path(tmp_path).iterdir())) == 3

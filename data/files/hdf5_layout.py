@@ -11,7 +11,6 @@ import hashlib
 import io
 import os
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 import h5py
@@ -94,9 +93,7 @@ class Layout:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.file.close()
 
     def reserve(self, group: h5py.Group, name: str, shape: Sequence[int], dtype: DTypeLike) -> tuple[h5py.Dataset, int]:

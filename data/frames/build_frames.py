@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -307,33 +307,22 @@ class FrameJob(SceneJob[FramePlan]):
     ) -> tuple[list[Any], NDArray[np.intp]]:
         """Return images of views, those that share all else together, and the order in which they are the views."""
         views, parts, shown = _views(truth), [], []
-        for members, group in _alike(truth):
-            renderer = copy.copy(renderers[group.class_index])
-            renderer.albedo = group.albedo
-            background = _background(group.wall_m, group.floor_m, self.plan)
+        for members in _alike(truth):
+            class_index, albedo, wall_m, floor_m = (truth[key][members[0]] for key in _KEYS)
+            renderer = copy.copy(renderers[class_index])
+            renderer.albedo = float(albedo)
+            background = _background(wall_m, floor_m, self.plan)
             parts.append(renderer.render_views(views[members], background=background, **options))
             shown.append(members)
         return parts, np.argsort(np.concatenate(shown))
 
 
-class _Group(NamedTuple):
-    """Properties that views rendered together have in common."""
-
-    class_index: int
-    albedo: float
-    wall_m: float
-    floor_m: float
-
-
-def _alike(truth: dict[str, NDArray[Any]]) -> Iterator[tuple[NDArray[np.intp], _Group]]:
-    """Yield which views agree in landmark, albedo and background, and in what."""
+def _alike(truth: dict[str, NDArray[Any]]) -> Iterator[NDArray[np.intp]]:
+    """Yield which views agree in landmark, albedo and background."""
     table = np.stack([np.nan_to_num(truth[key].astype(float), nan=-1.0) for key in _KEYS], axis=1)
     kinds, group_of = np.unique(table, axis=0, return_inverse=True)
-    group_of = group_of.reshape(-1)
     for k in range(len(kinds)):
-        members = np.flatnonzero(group_of == k)
-        class_index, albedo, wall_m, floor_m = (truth[key][members[0]] for key in _KEYS)
-        yield members, _Group(int(class_index), float(albedo), float(wall_m), float(floor_m))
+        yield np.flatnonzero(group_of.reshape(-1) == k)
 
 
 def _of_each_frequency(frames: Frames) -> dict[str, NDArray[Any]]:

@@ -320,12 +320,9 @@ class FrameSet(StoredScene):
 
     def _refuse_without_histograms(self) -> None:
         if not self.plan.histograms:
-            raise UsageError(f"{self.path} holds no histograms: {self._why_no_histograms()}")
-
-    def _why_no_histograms(self) -> str:
-        if self.sensor.histogram is None:
-            return "its sensor has no [histogram] table"
-        return "build it without 'histograms = false'"
+            no_table = self.sensor.histogram is None
+            why = "its sensor has no [histogram] table" if no_table else "build it without 'histograms = false'"
+            raise UsageError(f"{self.path} holds no histograms: {why}")
 
     def view(self, number: int) -> Frames:
         """Return all frames of one view, (1, frames_per_view, rows, cols).

@@ -314,25 +314,20 @@ class _Run:
         old = _Manifest.read(self.manifest) if self._worth_keeping else None
         if old is not None and not (resume or force):
             refuse_unfinished(self.path)
-        if old is not None and resume:
-            same = old.identity == identity and old.header_sha256 == header_sha256
-            if not same and not force:
-                refuse_difference(self.path, old.identity, identity)
-                raise OutputExistsError(f"{self.path}: was begun with other mesh files: force=True starts over")
-            old = old if same else None
-        elif old is not None:
-            old = None
-        if old is None:
-            self._worth_keeping = False
+        same = old is not None and (old.identity, old.header_sha256) == (identity, header_sha256)
+        if old is not None and resume and not same and not force:
+            refuse_difference(self.path, old.identity, identity)
+            raise OutputExistsError(f"{self.path}: was begun with other mesh files: force=True starts over")
+        if old is not None and resume and same:
+            self.state = old
+        else:
+            old, self.state, self._worth_keeping = None, fresh, False
             os.ftruncate(self._file, 0)
             self.manifest.unlink(missing_ok=True)
-        self.state = old or fresh
-        if old is None:
             self._start_manifest()  # before the first byte: what has no manifest is not ours
         layout.write_to(self._file)
-        kept = dict(filter(self._is_intact, self.state.shards.items())) if old is not None else {}
-        self.state.shards = kept
-        self._worth_keeping = bool(kept)
+        self.state.shards = dict(filter(self._is_intact, self.state.shards.items()))
+        self._worth_keeping = bool(self.state.shards)
         os.fsync(self._file)
         if old is not None:
             self._start_manifest()

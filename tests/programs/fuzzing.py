@@ -103,23 +103,10 @@ def checksum(path: Path) -> None:
     read_checksum(path.with_suffix(""))
 
 
-KINDS: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "npy": (".npy", frames), "npz": (".npz", stated_frames), "png": (".png", stated_frames), "csv": (".csv", frames),
-    "board": (".log", stated_frames),
-    **{f"{kind}-plan": (".toml", plan(kind)) for kind in PLANS},
-    "sensor": (".toml", Sensor.from_toml), "camera-info": (".yaml", Sensor.from_camera_info),
-    "map": (".toml", read_landmark_map),
-    "poses": (".csv", read_poses), "manifest": (".manifest", _Manifest.read),
-    "checksum": (".sha256", checksum), "stl": (".stl", mesh), "ply": (".ply", mesh), "obj": (".obj", mesh),
-    "off": (".off", mesh), "bag": ("", stated_frames), "h5": (".h5", stated_frames), "bank": (".h5", whole_bank),
-    "frames": (".h5", whole_frames),
-}  # fmt: skip
-
-
 def seeds(kind: str, folder: Path) -> list[bytes]:
     """Return small good files of a kind, and what is kept in the corpus; a bag is a list of files with their names."""
     kept = [path.read_bytes() for path in sorted((CORPUS / kind).glob("*"))] if kind != "bag" else []
-    return kept + GOOD[kind](folder)
+    return kept + KINDS[kind][2](folder)
 
 
 def _image() -> NDArray[Any]:
@@ -277,16 +264,20 @@ def _packed(path: Path) -> bytes:
     return f"{path.name}\n{len(content)}\n".encode() + content
 
 
-GOOD: dict[str, Callable[[Path], list[bytes]]] = {
-    "npy": _good_npy, "npz": _good_npz, "png": _good_png, "csv": _good_csv,
-    "board": _good_board,
-    **{f"{kind}-plan": _good_plan(kind) for kind in PLANS},
-    "sensor": _good_sensor, "camera-info": _good_camera_info, "map": _good_map,
-    "poses": _good_poses,
-    "manifest": _good_manifest, "checksum": _good_checksum,
-    **{kind: _good_mesh(kind) for kind in ("stl", "ply", "obj", "off")},
-    "bag": _good_bag, "h5": _good_h5, "bank": _good_bank, "frames": _good_frames,
+KINDS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], list[bytes]]]] = {
+    "npy": (".npy", frames, _good_npy), "npz": (".npz", stated_frames, _good_npz),
+    "png": (".png", stated_frames, _good_png), "csv": (".csv", frames, _good_csv),
+    "board": (".log", stated_frames, _good_board),
+    **{f"{kind}-plan": (".toml", plan(kind), _good_plan(kind)) for kind in PLANS},
+    "sensor": (".toml", Sensor.from_toml, _good_sensor),
+    "camera-info": (".yaml", Sensor.from_camera_info, _good_camera_info),
+    "map": (".toml", read_landmark_map, _good_map), "poses": (".csv", read_poses, _good_poses),
+    "manifest": (".manifest", _Manifest.read, _good_manifest), "checksum": (".sha256", checksum, _good_checksum),
+    **{kind: (f".{kind}", mesh, _good_mesh(kind)) for kind in ("stl", "ply", "obj", "off")},
+    "bag": ("", stated_frames, _good_bag), "h5": (".h5", stated_frames, _good_h5),
+    "bank": (".h5", whole_bank, _good_bank), "frames": (".h5", whole_frames, _good_frames),
 }  # fmt: skip
+"""For each kind of file: how its name ends, its reader, and what makes small good files of it."""
 
 
 def mutate(content: bytes, others: Sequence[bytes], rng: random.Random) -> bytes:
@@ -359,19 +350,14 @@ def _npy(values: NDArray[Any]) -> bytes:
 
 def put(kind: str, content: bytes, folder: Path) -> Path:
     """Write an input where its reader finds it; return that path."""
-    suffix, _ = KINDS[kind]
-    path = folder / f"input{suffix}"
+    path = folder / f"input{KINDS[kind][0]}"
     if kind != "bag":
         path.write_bytes(content)
         return path
     shutil.rmtree(path, ignore_errors=True)
     path.mkdir()
-    at = 0
-    while at < len(content):
-        head = content[at : at + 300].split(b"\n", 2)
-        at += len(head[0]) + len(head[1]) + 2
-        (path / head[0].decode("latin1")[:80]).write_bytes(content[at : at + int(head[1])])
-        at += int(head[1])
+    for name, body in _unpacked(content):
+        (path / name.decode("latin1")[:80]).write_bytes(body)
     return path
 
 
@@ -467,15 +453,21 @@ def fuzz(kind: str, count: int, seed: int, folder: Path) -> dict[str, Any]:
 
 
 def _mutated_bag(content: bytes, rng: random.Random) -> bytes:
+    files = _unpacked(content)
+    victim = rng.choice(files)
+    victim[1] = mutate(victim[1], [victim[1]], rng)
+    return b"".join(b"%s\n%d\n" % (name, len(body)) + body for name, body in files)
+
+
+def _unpacked(content: bytes) -> list[list[bytes]]:
+    """Return names and contents of the files of a bag."""
     files, at = list[list[bytes]](), 0
     while at < len(content):
         name, size, _ = content[at : at + 300].split(b"\n", 2)
         at += len(name) + len(size) + 2
         files.append([name, content[at : at + int(size)]])
         at += int(size)
-    victim = rng.choice(files)
-    victim[1] = mutate(victim[1], [victim[1]], rng)
-    return b"".join(b"%s\n%d\n" % (name, len(body)) + body for name, body in files)
+    return files
 
 
 def main(kinds: str, count: str, seed: str, folder: str) -> int:
