@@ -77,37 +77,37 @@ class Distribution(PlanModel):
         return self
 
     @property
-    def lowest(self) -> float:
-        """The least value that can be drawn."""
+    def limits(self) -> tuple[float, float]:
+        """The least and the largest value that can be drawn."""
         if self.fixed is not None:
-            return self.fixed
+            return self.fixed, self.fixed
         if self.normal is not None:
-            return self.within[0] if self.within else (-math.inf if self.normal[1] else self.normal[0])
+            mean, std = self.normal
+            return self.within or ((-math.inf, math.inf) if std else (mean, mean))
         pair = self.uniform or self.sobol
         assert pair is not None
-        return pair[0]
+        return pair
+
+    @property
+    def lowest(self) -> float:
+        """The least value that can be drawn."""
+        return self.limits[0]
 
     @property
     def highest(self) -> float:
         """The largest value that can be drawn."""
-        if self.normal is not None:
-            return self.within[1] if self.within else (math.inf if self.normal[1] else self.normal[0])
-        pair = self.uniform or self.sobol
-        return self.lowest if pair is None else pair[1]
+        return self.limits[1]
 
     def values(self, share: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the values below which the shares `share`, in (0, 1), of all draws lie."""
-        if self.fixed is not None:
-            return np.full(share.shape, self.fixed)
-        if self.normal is not None:
-            mean, std = self.normal
-            if self.within is None or std == 0:
-                return np.asarray(mean + std * special.ndtri(share))
-            low, high = (special.ndtr((bound - mean) / std) for bound in self.within)
-            return np.clip(mean + std * special.ndtri(low + (high - low) * share), *self.within)
-        pair = self.uniform or self.sobol
-        assert pair is not None
-        return pair[0] + (pair[1] - pair[0]) * share
+        if self.normal is None:
+            low, high = self.limits
+            return low + (high - low) * share
+        mean, std = self.normal
+        if self.within is None or std == 0:
+            return np.asarray(mean + std * special.ndtri(share))
+        low, high = (special.ndtr((bound - mean) / std) for bound in self.within)
+        return np.clip(mean + std * special.ndtri(low + (high - low) * share), *self.within)
 
 
 def _to_distribution(value: Any, info: ValidationInfo) -> Any:
@@ -346,7 +346,7 @@ class FramePlan(ScenePlan):
             elif spread.sobol is not None:
                 truth[name] = spread.values(sobol[name])
             elif spread.fixed is not None:
-                truth[name] = spread.values(np.zeros(stop - start))
+                truth[name] = np.full(stop - start, spread.fixed)
             else:
                 truth[name] = spread.values(self._uniform(name, start, stop))
         ends = np.cumsum(list(self.splits.values()))
