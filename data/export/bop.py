@@ -26,6 +26,7 @@ from phasemark.data.measured.reading import RangeOrZ
 IMAGES_PER_SCENE = 1000
 _SPLITS = ("train", "val", "test")
 _MM = 1000.0
+_Picture = NDArray[Any]
 
 
 def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
@@ -44,6 +45,7 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     _write_json(
         folder / "dataset_info.json", {"quantity": "z", "classes": list(frames.classes), "seed": frames.plan.seed}
     )
+    projection = {"cam_K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], "depth_scale": metres_per_unit * _MM}
     brightest = max(1.0, *(float(np.max(sample.get("amplitude_e", 1.0))) for _, sample in blocks(frames)))
     scenes: dict[str, _Scene] = {}
     counts = dict.fromkeys(frames.splits, 0)
@@ -54,31 +56,24 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
             split = frames.splits[int(sample["split_index"][k])]
             number = counts[split]
             counts[split] += 1
-            image = number % IMAGES_PER_SCENE
+            scene, image = divmod(number, IMAGES_PER_SCENE)
             if image == 0:
                 if split in scenes:
                     scenes[split].finish()
                 kind = split if split in _SPLITS else f"train_{split}"
-                scenes[split] = _Scene(folder / kind / f"{number // IMAGES_PER_SCENE:06d}")
+                scenes[split] = _Scene(folder / kind / f"{scene:06d}")
             class_index = int(sample["class_index"][k])
             rotation, translation_m = _pose(frames, sample, k, centres[class_index])
-            scenes[split].add(
-                image,
-                depth=to_codes(z_m[k], metres_per_unit),
-                grey=_grey(sample, k, brightest),
-                mask=sample["coverage"][k] >= 0.5,
-                camera={"cam_K": [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0], "depth_scale": metres_per_unit * _MM},
-                truth={
-                    "cam_R_m2c": rotation.ravel().tolist(), "cam_t_m2c": (translation_m * _MM).tolist(),
-                    "obj_id": class_index + 1,
-                },
-            )  # fmt: skip
+            truth = {
+                "cam_R_m2c": rotation.ravel().tolist(), "cam_t_m2c": (translation_m * _MM).tolist(),
+                "obj_id": class_index + 1,
+            }  # fmt: skip
+            depth, grey = to_codes(z_m[k], metres_per_unit), _grey(sample, k, brightest)
+            scenes[split].add(image, depth, grey, sample["coverage"][k] >= 0.5, projection, truth)
             if split == "test":
-                targets.append(
-                    {"im_id": image, "inst_count": 1, "obj_id": class_index + 1, "scene_id": number // IMAGES_PER_SCENE}
-                )
-    for scene in scenes.values():
-        scene.finish()
+                targets.append({"im_id": image, "inst_count": 1, "obj_id": class_index + 1, "scene_id": scene})
+    for last in scenes.values():
+        last.finish()
     if targets:
         _write_json(folder / "test_targets_bop19.json", targets)
 
@@ -90,27 +85,19 @@ class _Scene:
         self._folder = folder
         for name in ("depth", "gray", "mask", "mask_visib"):
             (folder / name).mkdir(parents=True)
-        self._camera: dict[str, Any] = {}
-        self._truth: dict[str, Any] = {}
-        self._info: dict[str, Any] = {}
+        self._facts: dict[str, dict[str, Any]] = {"camera": {}, "gt": {}, "gt_info": {}}
 
     def add(
-        self,
-        image: int,
-        *,
-        depth: NDArray[np.uint16],
-        grey: NDArray[np.uint8],
-        mask: NDArray[np.bool_],
-        camera: dict[str, Any],
-        truth: dict[str, Any],
+        self, image: int, depth: _Picture, grey: _Picture, mask: _Picture, camera: dict[str, Any], truth: dict[str, Any]
     ) -> None:
         Image.fromarray(depth).save(self._folder / "depth" / f"{image:06d}.png")
         Image.fromarray(grey).save(self._folder / "gray" / f"{image:06d}.png")
         for name in ("mask", "mask_visib"):  # nothing stands before the landmark
             Image.fromarray(mask.astype(np.uint8) * 255).save(self._folder / name / f"{image:06d}_000000.png")
-        self._camera[str(image)], self._truth[str(image)] = camera, [truth]
         box, count = _bounding_box(mask), int(mask.sum())
-        self._info[str(image)] = [
+        self._facts["camera"][str(image)] = camera
+        self._facts["gt"][str(image)] = [truth]
+        self._facts["gt_info"][str(image)] = [
             {
                 "bbox_obj": box, "bbox_visib": box, "px_count_all": count,
                 "px_count_valid": int((mask & (depth > 0)).sum()), "px_count_visib": count,
@@ -119,9 +106,8 @@ class _Scene:
         ]  # fmt: skip
 
     def finish(self) -> None:
-        _write_json(self._folder / "scene_camera.json", self._camera)
-        _write_json(self._folder / "scene_gt.json", self._truth)
-        _write_json(self._folder / "scene_gt_info.json", self._info)
+        for name, facts in self._facts.items():
+            _write_json(self._folder / f"scene_{name}.json", facts)
 
 
 def _grey(sample: dict[str, Any], k: int, brightest: float) -> NDArray[np.uint8]:

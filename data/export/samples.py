@@ -22,7 +22,7 @@ BLOCK = 1024
 TRUTH = (
     "distance_m", "delta_deg", "bearing_deg", "height_m", "pitch_deg", "roll_deg", "albedo", "wall_m", "floor_m",
 )  # fmt: skip
-"""What is told of a frame beside its class, in the units of plans; a sample has angles in radians."""
+"""Truth of a frame beside its class, in the units of plans; a sample has angles in radians."""
 
 
 def blocks(frames: FrameSet) -> Iterator[tuple[int, Sample]]:

@@ -200,7 +200,7 @@ class _Answers:
 
     @property
     def counted(self) -> str:
-        """What has an answer."""
+        """Name of a thing that has an answer."""
         return "frame" if self.moving else "position"
 
     def match_all(self, matcher: Matcher, positions: Frames | DirectPositions) -> None:
