@@ -207,14 +207,12 @@ def _quantity_row(one: SheetQuantity) -> dict[str, str]:
 
 
 def _points_csv(found: Characterisation) -> str:
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
     header = ("figure", "label", "x_name", "x", "y_name", "predicted", "simulated", "low95", "high95", "samples")
-    writer.writerow((*header, "compared"))
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, (*header, "compared"), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for one in found.as_dict()["comparisons"]:
-        for point in one["points"]:
-            own = {**one, **point, "compared": int(point["compared"])}
-            writer.writerow([own[key] for key in (*header, "compared")])
+        writer.writerows({**one, **point, "compared": int(point["compared"])} for point in one["points"])
     return buffer.getvalue()
 
 

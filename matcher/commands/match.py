@@ -67,8 +67,6 @@ def match_frames(
     learn_orientation
         With refine: learn from up to 10 frames how the image is mirrored and turned, then match.
     """
-    from phasemark.matcher.figures import match_figure
-
     place.check()
     landmark.check(bank)
     landmarks = place.landmarks()
@@ -97,6 +95,8 @@ def match_frames(
         if results.as_json:
             echo_json({"bank": str(bank), "frames": str(frames), "matches": printed.answers})
         for k, path in plots.items():
+            from phasemark.matcher.figures import match_figure  # matplotlib takes half a second to load
+
             filtered, match = printed.drawn[k]
             figure = match_figure(filtered, match, opened, search.background, reported=search.on == "reported")
             write_figure(path, figure, results.force)
@@ -222,7 +222,8 @@ class _Answers:
             for batch in match_in_batches(matcher, positions, self.search.filter(), at_once=at_once):
                 answers = [self._answer(batch, k) for k in range(len(batch.matches))]
                 self._print(answers, batch.start, columns)
-                self.estimated.add(batch)
+                if self.results.estimates is not None:
+                    self.estimated.add(batch)
                 sys.stdout.flush()
                 if progress is not None:
                     progress(batch.start + len(batch.matches), n)
