@@ -57,7 +57,7 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
 
 
 def example_trials(job: SweepJob, trials: SweepTrials, n: int, folder: Path) -> Iterator[dict[str, Any]]:
-    """Yield what a page shows of trials of each method: of median error over its bound, and the n worst conditions'."""
+    """Yield entries of a page for each method: a trial of median error over its bound, and its n worst conditions."""
     error = trials.error
     for m in range(len(trials.methods)):
         with np.errstate(invalid="ignore"):

@@ -112,7 +112,7 @@ def _page(
 
 
 def _written(shown: SweepFigure, folder: Path) -> dict[str, Any]:
-    """Write a figure as PNG and SVG, and return what the page shows of it."""
+    """Write a figure as PNG and SVG, and return its entry on the page."""
     png, svg = figure_png(shown.figure), io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "phasemark"}):  # or the names inside would differ each time
         shown.figure.savefig(svg, format="svg", metadata={"Date": None})

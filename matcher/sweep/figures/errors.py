@@ -285,7 +285,7 @@ _PLANE = ("delta_deg", "distance_m")
 
 
 def _over_plane(cells: Sequence[Cell], method: str, of: Callable[[list[Cell]], Any]) -> NDArray[Any]:
-    """Return what a function makes of a method's cells at each distance (rows) and angle (columns)."""
+    """Return a function's results for a method's cells at each distance (rows) and angle (columns)."""
     angles, distances = (_values(cells, axis) for axis in _PLANE)
     groups: dict[tuple[float, float], list[Cell]] = {(d, a): [] for d in distances for a in angles}
     for cell in cells:
