@@ -20,6 +20,25 @@ _W0, _W1 = np.uint64(0x9E3779B9), np.uint64(0xBB67AE85)
 _LOW_BITS, _HIGH_SHIFT = np.uint64(11), np.uint64(21)
 _UNIT = 2.0**-53
 _CENTRAL, _NEAR = 0.425, 5.0
+_MIDDLE = (
+    (2.5090809287301226727e3, 3.3430575583588128105e4, 6.7265770927008700853e4, 4.5921953931549871457e4,
+     1.3731693765509461125e4, 1.9715909503065514427e3, 1.3314166789178437745e2, 3.3871328727963666080e0),
+    (5.2264952788528545610e3, 2.8729085735721942674e4, 3.9307895800092710610e4, 2.1213794301586595867e4,
+     5.3941960214247511077e3, 6.8718700749205790830e2, 4.2313330701600911252e1, 1.0),
+)  # fmt: skip
+_NEAR_TAIL = (
+    (7.74545014278341407640e-4, 2.27238449892691845833e-2, 2.41780725177450611770e-1, 1.27045825245236838258e0,
+     3.64784832476320460504e0, 5.76949722146069140550e0, 4.63033784615654529590e0, 1.42343711074968357734e0),
+    (1.05075007164441684324e-9, 5.47593808499534494600e-4, 1.51986665636164571966e-2, 1.48103976427480074590e-1,
+     6.89767334985100004550e-1, 1.67638483018380384940e0, 2.05319162663775882187e0, 1.0),
+)  # fmt: skip
+_FAR_TAIL = (
+    (2.01033439929228813265e-7, 2.71155556874348757815e-5, 1.24266094738807843860e-3, 2.65321895265761230930e-2,
+     2.96560571828504891230e-1, 1.78482653991729133580e0, 5.46378491116411436990e0, 6.65790464350110377720e0),
+    (2.04426310338993978564e-15, 1.42151175831644588870e-7, 1.84631831751005468180e-5, 7.86869131145613259100e-4,
+     1.48753612908506148525e-2, 1.36929880922735805310e-1, 5.99832206555887937690e-1, 1.0),
+)  # fmt: skip
+"""Numerators and denominators of AS 241 (Wichura, 1988): the middle of the normal distribution, and its tails."""
 
 _ATTEMPT_SHIFT = np.uint64(8)  # the fourth word of the counter: term in the lowest byte, attempts above it
 
@@ -122,67 +141,29 @@ def fill_normal(uniform, chosen, out):
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _central_quantile(q):
     """Return the normal quantile for |q| = |p − ½| up to 0.425: AS 241 (Wichura, 1988), good to 1e-15."""
-    r = _CENTRAL * _CENTRAL - q * q
-    num = 2.5090809287301226727e3
-    num = num * r + 3.3430575583588128105e4
-    num = num * r + 6.7265770927008700853e4
-    num = num * r + 4.5921953931549871457e4
-    num = num * r + 1.3731693765509461125e4
-    num = num * r + 1.9715909503065514427e3
-    num = num * r + 1.3314166789178437745e2
-    num = num * r + 3.3871328727963666080e0
-    den = 5.2264952788528545610e3
-    den = den * r + 2.8729085735721942674e4
-    den = den * r + 3.9307895800092710610e4
-    den = den * r + 2.1213794301586595867e4
-    den = den * r + 5.3941960214247511077e3
-    den = den * r + 6.8718700749205790830e2
-    den = den * r + 4.2313330701600911252e1
-    den = den * r + 1.0
-    return q * num / den
+    top, bottom = _both(_MIDDLE, _CENTRAL * _CENTRAL - q * q)
+    return q * top / bottom
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _near_tail(r):
     """Return the size of the normal quantile by AS 241 for r = √(−ln p) up to 5, p being the smaller share."""
-    r -= 1.6
-    num = 7.74545014278341407640e-4
-    num = num * r + 2.27238449892691845833e-2
-    num = num * r + 2.41780725177450611770e-1
-    num = num * r + 1.27045825245236838258e0
-    num = num * r + 3.64784832476320460504e0
-    num = num * r + 5.76949722146069140550e0
-    num = num * r + 4.63033784615654529590e0
-    num = num * r + 1.42343711074968357734e0
-    den = 1.05075007164441684324e-9
-    den = den * r + 5.47593808499534494600e-4
-    den = den * r + 1.51986665636164571966e-2
-    den = den * r + 1.48103976427480074590e-1
-    den = den * r + 6.89767334985100004550e-1
-    den = den * r + 1.67638483018380384940e0
-    den = den * r + 2.05319162663775882187e0
-    den = den * r + 1.0
-    return num / den
+    top, bottom = _both(_NEAR_TAIL, r - 1.6)
+    return top / bottom
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _far_tail(r):
     """Return the size of the normal quantile by AS 241 for r above 5."""
-    r -= 5.0
-    num = 2.01033439929228813265e-7
-    num = num * r + 2.71155556874348757815e-5
-    num = num * r + 1.24266094738807843860e-3
-    num = num * r + 2.65321895265761230930e-2
-    num = num * r + 2.96560571828504891230e-1
-    num = num * r + 1.78482653991729133580e0
-    num = num * r + 5.46378491116411436990e0
-    num = num * r + 6.65790464350110377720e0
-    den = 2.04426310338993978564e-15
-    den = den * r + 1.42151175831644588870e-7
-    den = den * r + 1.84631831751005468180e-5
-    den = den * r + 7.86869131145613259100e-4
-    den = den * r + 1.48753612908506148525e-2
-    den = den * r + 1.36929880922735805310e-1
-    den = den * r + 5.99832206555887937690e-1
-    den = den * r + 1.0
-    return num / den
+    top, bottom = _both(_FAR_TAIL, r - _NEAR)
+    return top / bottom
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+def _both(coefficients, r):
+    """Return the values at r of two polynomials of degree 7, whose coefficients begin with the highest power."""
+    above, below = coefficients
+    top, bottom = above[0], below[0]
+    for k in range(1, 8):
+        top, bottom = top * r + above[k], bottom * r + below[k]
+    return top, bottom
