@@ -239,7 +239,7 @@ class Frames:
         ranges_alone: bool = False,
     ) -> Self:
         """Return frames with `change` made to each array, (n, frames, ...); without taps and stamps if asked for."""
-        arrays = {
+        arrays: dict[str, Any] = {
             name: change(values)
             for name in ("amplitude_e", "intensity_e", "flags", *(() if ranges_alone else ("taps_e", "time_s")))
             if (values := getattr(self, name)) is not None
