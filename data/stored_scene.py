@@ -75,7 +75,8 @@ class StoredScene:
     def _open(self) -> h5py.File:
         if self._closed:
             raise UsageError(f"{self.path}: the {self.WHAT} is closed")
-        if self._process != os.getpid():  # after a fork HDF5's handles are not ours to use
+        # after a fork HDF5's handles are not ours to use; a temporary file has no other
+        if self._process != os.getpid() and self.path.exists():
             self._file, self._process = h5py.File(self.path, "r"), os.getpid()
         return self._file
 

@@ -15,7 +15,7 @@ from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.render import Renderer, Views, capture
 
-GRID = {"distance_m": "0.6:1.5:0.02", "delta_deg": "0:360:2"}
+GRID = {"distance_m": "0.66:1.34:0.02", "delta_deg": "0:360:2"}
 FREE = [pytest.param(None, marks=pytest.mark.soak), ("distance_m", "delta_rad")]
 HEXAGON = trimesh.creation.cylinder(0.2, 0.5, sections=6)
 TRIANGLE = trimesh.creation.cylinder(0.25, 0.5, sections=3)

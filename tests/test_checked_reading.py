@@ -22,7 +22,6 @@ from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_b
 from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
 from phasemark.data.files.narrow import narrowed
-from phasemark.data.verify import verify_frames
 from phasemark.inputs import checksum_path, is_vouched_for, read_whole, unverified
 from phasemark.landmarks import read_mesh
 from phasemark.matcher.plan_kinds import plan_example
@@ -181,31 +180,10 @@ def test_hdf5_from_a_pipe_is_one_line(tmp_path, capsys):
     assert "copy it to a file first" in capsys.readouterr().err
 
 
-def test_more_splits_than_their_numbers_have_bytes_for_are_refused(tmp_path):
-    splits = {f"s{k}": 1 / 256 for k in range(256)}
-    plan = FramePlan(classes=["cone"], views=300, splits=splits)
-    assert plan.resolve().draw_truth()["split_index"].max() > 200
-    with pytest.raises(UsageError, match="'splits' must be at most 256, got 300"):
-        FramePlan(views=1, splits={f"s{k}": 1 / 300 for k in range(300)})
-
-
 @pytest.mark.parametrize(("value", "kind"), [(256, "|u1"), (-1, "|u1"), (32768, "<i2"), (2**31, "<i4"), (-129, "|i1")])
 def test_a_number_that_does_not_fit_its_type_is_refused(value, kind):
     with pytest.raises(UsageError, match=f"got {value}"):
         narrowed([0, value], kind, "splits")
-
-
-def test_verify_finds_a_column_that_the_plan_does_not_draw(folder):
-    path = folder / "frames.h5"
-    for name, change in (("split", 1), ("distance", 0.1), ("seed_index", 1)):
-        copy = folder / f"{name}.h5"
-        shutil.copy(path, copy)
-        with h5py.File(copy, "r+") as file:
-            values = file[name][...]
-            file[name][...] = (values + change) % 3 if name == "split" else values + change
-        write_checksum(copy)
-        with pytest.raises(InputFileError, match=f"'{name}' is not what its plan draws"):
-            verify_frames(copy)
 
 
 def npy(header, values=b""):

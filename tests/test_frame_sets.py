@@ -70,6 +70,7 @@ def sha256(path):
         ({"views": 1, "wall_m": -1}, "'wall_m' must be positive"),
         ({"views": 1, "albedo": {"uniform": [0, 1]}}, "'albedo' must be in"),
         ({"views": 1, "splits": {"train": 0.5}}, "'splits' must be shares that add up to 1"),
+        ({"views": 1, "splits": {f"s{k}": 1 / 300 for k in range(300)}}, "'splits' must be at most 256, got 300"),
         ({"views": 1, "colour": "red"}, "unknown key 'colour'"),
         (
             {"views": 1, "distance_m": "near"},
@@ -135,6 +136,11 @@ def test_values_follow_their_distributions():
     assert abs((truth["split_index"] == 0).mean() - 0.25) < 4.1 * np.sqrt(0.25 * 0.75 / n)
     for k in range(4):
         assert abs((truth["class_index"] == k).mean() - 0.25) < 4.1 * np.sqrt(0.25 * 0.75 / n)
+
+
+def test_each_of_256_splits_has_a_number():
+    plan = FramePlan(classes=["cone"], views=300, splits={f"s{k}": 1 / 256 for k in range(256)})
+    assert plan.resolve().draw_truth()["split_index"].max() > 200
 
 
 def test_quantities_are_independent_of_one_another():
@@ -361,12 +367,15 @@ def test_verify_reports_every_flipped_bit_and_every_cut(frames_file, tmp_path, n
         ("range_mixed", 0.01, "'range_mixed' of item"),
         ("range", 0.01, "'range' of item"),
         ("flags", 1, "'range' has"),
+        *((name, None, f"'{name}' is not what its plan draws") for name in ("split", "distance", "seed_index")),
     ],
 )
 def test_verify_finds_what_a_forged_checksum_hides(frames_file, tmp_path, name, change, message):
     path = Path(shutil.copy(frames_file, tmp_path))
     with h5py.File(path, "r+") as file:
-        if np.isfinite(change) and name.startswith("range"):
+        if change is None:
+            file[name][...] = np.roll(file[name][...], 1)
+        elif np.isfinite(change) and name.startswith("range"):
             file[name][...] = file[name][...] + np.float32(change)
         else:
             file[name][0, 8, 8] = change

@@ -193,7 +193,7 @@ def test_a_rename_that_replaces_nothing_refuses_an_existing_name(tmp_path, monke
         assert (tmp_path / "b").read_bytes() == b"a"
 
 
-@pytest.mark.parametrize("action", ["kill", "ENOSPC", "EIO", "other"])
+@pytest.mark.parametrize("action", ["kill", "ENOSPC", "other", pytest.param("EIO", marks=pytest.mark.soak)])
 def test_a_file_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(tmp_path, action):
     printed = run_program("file_crash_points", tmp_path, action)
     assert int(printed) > 15

@@ -113,14 +113,10 @@ def _whole_blocks(low: float, high: float, size: int, centre: float, n: int) -> 
         raise UsageError(f"'binning' must be at most {size}, the image's size, got {n}")
     low, high = max(low, 0.0), min(high, float(size))
     if centre == size / 2 and size % 2 == 0:  # the region stays centred
-        half = math.ceil(max(centre - low, high - centre) / n) * n
-        while half > size // 2:
-            half -= n
+        half = min(math.ceil(max(centre - low, high - centre) / n), size // 2 // n) * n
         if half > 0:
             return size // 2 - half, size // 2 + half
     first = math.floor(low)
-    count = math.ceil((high - first) / n)
-    while count > size // n:
-        count -= 1
+    count = min(math.ceil((high - first) / n), size // n)
     first = min(first, size - count * n)
     return first, first + count * n
