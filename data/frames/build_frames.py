@@ -114,11 +114,8 @@ class FrameJob(SceneJob[FramePlan]):
         super().__init__(plan, plan.build_sensor(), stored_mesh)
         self.fields = frame_set_fields(self.plan, self.sensor)
         self._renderers = [Renderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks]
-        self._histograms: list[HistogramRenderer] = []
-        if self.plan.histograms:
-            self._histograms = [
-                HistogramRenderer(landmark.mesh, self.sensor, albedo=landmark.albedo) for landmark in self.landmarks
-            ]
+        with_histograms = self.landmarks if self.plan.histograms else []
+        self._histograms = [HistogramRenderer(each.mesh, self.sensor, albedo=each.albedo) for each in with_histograms]
         self._shot_sensor = self.sensor.without_errors(shot_noise=True) if "shot" in self.plan.variants else None
 
     @property

@@ -9,10 +9,9 @@ import signal
 import sys
 from pathlib import Path
 
-from programs.system_calls import Trap, in_fork
+from programs.system_calls import ended, in_fork
 from programs.toy_job import ToyJob, check_toy_file
 
-from phasemark import StorageError
 from phasemark.data.shards.build import build, manifest_path, partial_path
 from phasemark.inputs import checksum_path, verify_checksum
 
@@ -20,12 +19,7 @@ CALLS = ("pwrite", "write", "fsync", "replace", "posix_fallocate", "ftruncate")
 
 
 def fail_at(path: Path, at: int, action: str, force: bool) -> int:
-    trap = Trap(at, action, CALLS)
-    try:
-        build(ToyJob(mark=1), path, workers=1, shard_items=3, force=force)
-    except StorageError:
-        return 5
-    return 0 if trap.count < at else 6  # 6: the call failed, and the build did without
+    return ended(lambda: build(ToyJob(mark=1), path, workers=1, shard_items=3, force=force), at, action, CALLS)
 
 
 def resume(path: Path) -> int:

@@ -10,9 +10,9 @@ import signal
 import sys
 from pathlib import Path
 
-from programs.system_calls import Trap, in_fork
+from programs.system_calls import ended, in_fork
 
-from phasemark import OutputExistsError, StorageError
+from phasemark import OutputExistsError
 from phasemark.data.files import write_atomically
 from phasemark.inputs import checksum_path, verify_checksum
 
@@ -27,16 +27,13 @@ def second(path: Path, force: bool) -> int:
 
 def fail_at(path: Path, at: int, action: str, force: bool) -> int:
     seconds: list[int] = []
-    trap = Trap(at, (lambda: seconds.append(in_fork(second, path, force))) if action == "other" else action)
-    try:
-        write_atomically(path, [b"new"], force=force, checksum=force)
-    except StorageError:
-        return 5
-    except OutputExistsError:
+    act = (lambda: seconds.append(in_fork(second, path, force))) if action == "other" else action
+    code = ended(lambda: write_atomically(path, [b"new"], force=force, checksum=force), at, act)
+    if code == 4:
         assert seconds in ([0], [4])
-        return 4
-    assert force or seconds in ([], [4]), "both believe that they made the file"
-    return 0 if trap.count < at else 6
+    elif code in (0, 6):
+        assert force or seconds in ([], [4]), "both believe that they made the file"
+    return code
 
 
 def main(folder: Path, action: str) -> None:

@@ -12,9 +12,9 @@ import signal
 import sys
 from pathlib import Path
 
-from programs.system_calls import Trap, in_fork
+from programs.system_calls import ended, in_fork
 
-from phasemark import OutputExistsError, StorageError
+from phasemark import OutputExistsError
 from phasemark.data.files import renames
 from phasemark.data.files.replaced_folder import replacing_folder
 
@@ -45,14 +45,9 @@ def second(path: Path) -> int:
 
 
 def fail_at(path: Path, at: int, action: str, force: bool) -> int:
-    trap = Trap(at, (lambda: in_fork(second, path)) if action == "other" else action)
-    try:
-        write(path, "new", force=force)
-    except StorageError:
-        return 5
-    except OutputExistsError:
-        return 4
-    return 0 if trap.count < at else 6  # 6: the call failed, and the writing did without
+    return ended(
+        lambda: write(path, "new", force=force), at, (lambda: in_fork(second, path)) if action == "other" else action
+    )
 
 
 def main(folder: Path, action: str, way: str) -> None:

@@ -8,6 +8,7 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from phasemark import PhasemarkError
 from phasemark.data.files import renames
 
 CALLS = (
@@ -53,6 +54,18 @@ class Trap:
             return call(*arguments, **options)
 
         return trapped
+
+
+def ended(
+    write: Callable[[], object], at: int, action: str | Callable[[], object], calls: Sequence[str] = CALLS
+) -> int:
+    """Write with a trap at a call; return the exit code: 0 without that call, 6 if it failed and nothing needed it."""
+    trap = Trap(at, action, calls)
+    try:
+        write()
+    except PhasemarkError as error:
+        return error.exit_code
+    return 0 if trap.count < at else 6
 
 
 def in_fork(function: Callable[..., int], *arguments: Any) -> int:
