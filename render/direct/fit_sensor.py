@@ -334,7 +334,7 @@ def _as_sensor(
     delays = delays_of(responses)
     width_m = h.bin_width_m
     start_bins = float(delays.mean())
-    scales, cycles = model.bin_scales(p), cycles_of(p)
+    scales, cycles = model.bin_scales(p), 1e6 / p["inverse_cycles"]
     grid = np.arange(-7.0, 32.0, _IRF_STEP_BINS)
     irf = []
     for zone in range(rows * cols):

@@ -217,9 +217,5 @@ class LensMap:
         return float(away[nearest]), float(radius[at[nearest]])
 
 
-@lru_cache(maxsize=64)
-def lens_map(
-    model: str, fx: float, fy: float, cx: float, cy: float, distortion: tuple[float, ...], rows: int, cols: int
-) -> LensMap:
-    """Return a :class:`LensMap`, made once for each lens and image size."""
-    return LensMap(model, fx, fy, cx, cy, distortion, rows, cols)
+lens_map = lru_cache(maxsize=64)(LensMap)
+"""Return a :class:`LensMap`, made once for each lens and image size."""

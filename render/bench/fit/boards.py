@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.bench.fit.fitted_sensor import Floats
@@ -174,17 +174,21 @@ def _range_errors(frames: Frames, truth_m: Floats, base: Sensor) -> Moments:
     return about._replace(mean=wrap_difference_m(centre + about.mean, base))
 
 
+def one_for_each(values: ArrayLike, distance_m: Sequence[float] | NDArray[np.floating], what: str) -> list[float]:
+    """Return a number for each distance, of which one may be given for all."""
+    numbers: list[float] = np.atleast_1d(np.asarray(values, np.float64)).ravel().tolist()
+    if len(numbers) == 1:
+        numbers *= len(distance_m)
+    if len(numbers) != len(distance_m):
+        raise UsageError(f"give one {what}, or one for each of the {len(distance_m)} distances, got {len(numbers)}")
+    return numbers
+
+
 def known_distance_std(
     distance_m: Sequence[float] | NDArray[np.floating], stated: float | Sequence[float] | None, notes: list[str]
 ) -> list[float]:
     """Return the standard deviation of each distance, and describe it in a note."""
-    std = np.atleast_1d(np.asarray(DISTANCE_STD_M if stated is None else stated, np.float64)).ravel().tolist()
-    if len(std) == 1:
-        std *= len(distance_m)
-    if len(std) != len(distance_m):
-        raise UsageError(
-            f"give one 'distance_std_m', or one for each of the {len(distance_m)} distances, got {len(std)}"
-        )
+    std = one_for_each(DISTANCE_STD_M if stated is None else stated, distance_m, "'distance_std_m'")
     if stated is None:  # of a board a few millimetres away it would be no small error
         std = [min(one, _MOST_DISTANCE_STD * d) for one, d in zip(std, distance_m, strict=True)]
     for one, distance in zip(std, distance_m, strict=True):

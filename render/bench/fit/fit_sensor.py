@@ -13,7 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.bench.fit.boards import FEWEST_FRAMES, PIXEL_STD_ERROR, BoardData, known_distance_std
+from phasemark.render.bench.fit.boards import (
+    FEWEST_FRAMES,
+    PIXEL_STD_ERROR,
+    BoardData,
+    known_distance_std,
+    one_for_each,
+)
 from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Findings, SensorFit
 from phasemark.render.bench.fit.light import fit_light, limit_contrast
 from phasemark.render.bench.fit.ranges import fit_offsets, fit_pixels, odd_pixels, pixel_offsets
@@ -83,11 +89,7 @@ def fit_sensor(
         )
     if amplitude_unit not in ("electrons", "arbitrary"):
         raise UsageError(f"'amplitude_unit' must be 'electrons' or 'arbitrary', got {amplitude_unit!r}")
-    albedos = [0.8] if albedo is None else list(albedo)
-    if len(albedos) == 1:
-        albedos *= len(frames)
-    if len(albedos) != len(frames):
-        raise UsageError(f"give one albedo, or one for each of the {len(frames)} distances, got {len(albedos)}")
+    albedos = one_for_each(0.8 if albedo is None else albedo, distance_m, "albedo")
     for one, distance in zip(frames, distance_m, strict=True):
         if len(one) != 1:
             raise UsageError(f"the frames at {distance:g} m must be of one position, got {len(one)}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -114,10 +114,7 @@ class SensorFit:
         """Return everything as plain numbers, lists and strings, for JSON; None where there is no number."""
         return {
             "sensor": self.sensor.model_dump(mode="json"),
-            "estimates": {
-                name: {"value": one.value, "std_error": one.std_error, "note": one.note}
-                for name, one in self.estimates.items()
-            },
+            "estimates": {name: asdict(one) for name, one in self.estimates.items()},
             "notes": list(self.notes),
             "n_frames": list(self.n_frames),
             "distance_std_m": list(self.distance_std_m),
