@@ -63,22 +63,13 @@ def test_the_half_angle_is_that_of_the_images_edge():
         np.testing.assert_allclose(d, np.array(expected) * math.cos(math.radians(11)), atol=1e-15)  # rounding
 
 
-@pytest.mark.parametrize("u", [1.25, 4.0, 7.3, 15.999])
-def test_a_rendered_point_is_seen_where_the_pixel_grid_says_horizontally(u):
-    y = TAN * (1 - 2 * u / 16)
-    plate = sheet((y, 2), (-2, 2))  # from y to far out on the left
-    covered = Renderer(plate, PMD).render(1.0).coverage[0]
-    np.testing.assert_allclose(covered.sum(axis=1), u, atol=1e-6)  # the convention is asked for to 1e-6 of a pixel
-    assert covered[0, 0] == pytest.approx(1, abs=1e-12)
-
-
-@pytest.mark.parametrize("v", [1.25, 4.0, 7.3, 15.999])
-def test_a_rendered_point_is_seen_where_the_pixel_grid_says_vertically(v):
-    z = TAN * (1 - 2 * v / 16)
-    plate = sheet((-2, 2), (z, 2))
-    covered = Renderer(plate, PMD).render(1.0).coverage[0]
-    np.testing.assert_allclose(covered.sum(axis=0), v, atol=1e-6)
-    assert covered[0, 0] == pytest.approx(1, abs=1e-12)
+@pytest.mark.parametrize("at", [1.25, 4.0, 7.3, 15.999])
+def test_a_rendered_point_is_seen_where_the_pixel_grid_says(at):
+    far, edge = (-2, 2), (TAN * (1 - 2 * at / 16), 2)  # from the edge to far out on the left, or above
+    for plate, across in ((sheet(edge, far), 1), (sheet(far, edge), 0)):
+        covered = Renderer(plate, PMD).render(1.0).coverage[0]
+        np.testing.assert_allclose(covered.sum(axis=across), at, atol=1e-6)  # the convention is asked for to 1e-6
+        assert covered[0, 0] == pytest.approx(1, abs=1e-12)
 
 
 def test_columns_and_rows_have_their_own_half_angle():
@@ -129,24 +120,21 @@ def test_a_positive_pitch_looks_down():
     assert v == pytest.approx(8 - 8 * math.tan(math.radians(1)) / TAN, abs=1e-3)  # 0.7 pixel higher
 
 
-def test_a_positive_roll_lowers_what_is_on_the_left():
-    roll = math.radians(10)
-    u, v = seen_at((0, 0.1, 0), PMD.with_(roll_deg=10))
-    # Rx(roll) turns the camera; the world turns the other way
-    assert u == pytest.approx(8 - 8 * 0.1 * math.cos(roll) / TAN, abs=5e-3)  # a ball off the axis is an ellipse
-    assert v == pytest.approx(8 + 8 * 0.1 * math.sin(roll) / TAN, abs=5e-3)
+ROLL, BEARING = math.radians(10), math.radians(3)
 
 
-def test_a_bearing_offset_moves_what_the_mount_points_at_to_the_left():
-    u, v = seen_at((0, 0, 0), PMD.with_(bearing_offset_deg=3))
-    assert u == pytest.approx(8 - 8 * math.tan(math.radians(3)) / TAN, abs=5e-3)  # a ball off the axis is an ellipse
-    assert v == pytest.approx(8, abs=5e-3)
-
-
-def test_a_height_offset_raises_the_landmark_in_the_image():
-    u, v = seen_at((0, 0, 0), PMD.with_(height_offset_m=0.05))
-    assert u == pytest.approx(8, abs=5e-3)
-    assert v == pytest.approx(8 - 8 * 0.05 / TAN, abs=5e-3)
+@pytest.mark.parametrize(
+    ("point", "mounting", "u", "v"),
+    [  # Rx(roll) turns the camera; the world turns the other way
+        ((0, 0.1, 0), {"roll_deg": 10}, 8 - 8 * 0.1 * math.cos(ROLL) / TAN, 8 + 8 * 0.1 * math.sin(ROLL) / TAN),
+        ((0, 0, 0), {"bearing_offset_deg": 3}, 8 - 8 * math.tan(BEARING) / TAN, 8),
+        ((0, 0, 0), {"height_offset_m": 0.05}, 8, 8 - 8 * 0.05 / TAN),
+    ],
+    ids=["a roll lowers what is on the left", "a bearing offset moves to the left", "a height offset raises"],
+)
+def test_a_positive_offset_of_the_mounting_moves_what_is_seen(point, mounting, u, v):
+    found = seen_at(point, PMD.with_(**mounting))
+    assert found == pytest.approx((u, v), abs=5e-3)  # a ball off the axis is an ellipse
 
 
 def test_offsets_of_the_mounting_are_added_to_views_and_the_images_keep_the_views_asked_for():

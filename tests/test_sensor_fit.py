@@ -3,6 +3,7 @@
 import json
 import math
 import tomllib
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -23,10 +24,15 @@ NEAR = tuple(np.linspace(0.7, 3.2, 8))
 Z = stats.norm.ppf(1 - 1e-3 / 2 / 40)  # 99.9 % over the about 40 numbers that this file compares: 4.2 σ
 
 
+@lru_cache(maxsize=64)
+def image_of(sensor, distance_m, albedo):
+    return board_image(sensor, distance_m, albedo)
+
+
 def take(sensor, distance_m, n=50, *, seed=0, albedo=0.8, amplitude=True, intensity=True, gain=1.0):
     """Frames of a board; `gain` turns electrons into units of somebody's own."""
     rng = np.random.default_rng([seed, round(1000 * distance_m)])
-    frames = capture(board_image(sensor, distance_m, albedo), sensor, rng=rng, n_frames=n)
+    frames = capture(image_of(sensor, distance_m, albedo), sensor, rng=rng, n_frames=n)
     return Frames(
         frames.range_m,
         gain * frames.amplitude_e if amplitude else None,
@@ -37,10 +43,7 @@ def take(sensor, distance_m, n=50, *, seed=0, albedo=0.8, amplitude=True, intens
 
 def fitted(sensor, distances, n=50, *, base=PMD, amplitude_unit="electrons", **options):
     boards = [take(sensor, d, n, **options) for d in distances]
-    fit = fit_sensor(boards, distances, base=base, albedo=[0.8], amplitude_unit=amplitude_unit, distance_std_m=0)
-    for name, one in fit.estimates.items():
-        print(f"{name} = {one.value:.6g} ± {one.std_error}: {one.note}")
-    return fit
+    return fit_sensor(boards, distances, base=base, albedo=[0.8], amplitude_unit=amplitude_unit, distance_std_m=0)
 
 
 def meets(fit, name, truth):
@@ -91,9 +94,14 @@ def test_photon_transfer_finds_the_electrons_of_an_arbitrary_unit():
     assert any("left aside" in note for note in aside.notes)
 
 
-def test_a_bad_day_is_recovered_within_its_intervals():
-    # square waves, patterns, stray light, converter and defects, distinguished by 8 distances of 100 frames
-    fit = fitted(BAD_DAY, NEAR, 100)
+@pytest.fixture(scope="module")
+def bad_day():
+    """Square waves, patterns, stray light, converter and defects, distinguished by 8 distances of 100 frames."""
+    return fitted(BAD_DAY, NEAR, 100)
+
+
+def test_a_bad_day_is_recovered_within_its_intervals(bad_day):
+    fit = bad_day
     unit = camera_unit(BAD_DAY)
     alive = ~(unit.dead | unit.hot)
     assert set(fit.sensor.dead_pixels) == {(int(r), int(c)) for r, c in np.argwhere(~alive)}
@@ -112,8 +120,8 @@ def test_a_bad_day_is_recovered_within_its_intervals():
     assert meets(fit, "contrast", 0.5)
 
 
-def test_the_fitted_wiggling_is_the_camera_s_own():
-    fit = fitted(BAD_DAY, NEAR, 100)
+def test_the_fitted_wiggling_is_the_camera_s_own(bad_day):
+    fit = bad_day
     assert [k for k, _, _ in fit.sensor.harmonics] == [3, 7]
     unit = camera_unit(BAD_DAY)
     alive = ~(unit.dead | unit.hot)
@@ -126,7 +134,6 @@ def test_the_fitted_wiggling_is_the_camera_s_own():
 
     true = error_m(BAD_DAY, unit.delay_rad[:, alive].mean())
     found = error_m(fit.sensor, fit.sensor.range_offset_m / fit.sensor.metres_per_radian)
-    print(f"wiggling: fitted curve off by {1e3 * np.abs(found - true).max():.2f} mm at most, of {np.ptp(true):.3f} m")
     # orders 3 and 7 meet in the 12th harmonic of the error by a_3 a_7 · c/4πf = 5.4 mm, which the fit cannot follow
     assert np.abs(found - true).max() < 5.4e-3
     assert np.ptp(true) > 0.3
@@ -147,19 +154,13 @@ def test_standard_errors_are_those_of_repeated_fits():
     high = stats.chi2.ppf(1 - 1e-3 / len(names), n)
     for name in names:
         pulls = np.array(found[name])
-        print(f"{name}: mean of pulls {pulls.mean():.2f}, r.m.s. {np.sqrt((pulls**2).mean()):.2f}")
         assert (pulls**2).sum() < high  # errors may be stated too large, never too small
 
 
 @pytest.mark.parametrize("n", [40, pytest.param(100, marks=pytest.mark.soak)])
 @pytest.mark.parametrize(
     ("given", "distances"),
-    [
-        ("ranges", (1.0,)),
-        ("ranges", (0.8, 2.0, 3.0)),
-        ("amplitude", (1.0, 1.1)),
-        ("intensity", (0.8, 2.0, 3.0)),
-    ],
+    [("ranges", (1.0,)), ("ranges", (0.8, 2.0, 3.0)), ("amplitude", (1.0, 1.1)), ("intensity", (0.8, 2.0, 3.0))],
 )
 def test_errors_of_the_distances_are_in_the_standard_errors(given, distances, n):
     # N = 40 or 100 sets of distances, each 5 mm (1 σ) off the truth, which the fit is told; 99.9 % over the 4 cases
@@ -182,9 +183,6 @@ def test_errors_of_the_distances_are_in_the_standard_errors(given, distances, n)
     level = 1 - 1e-3 / 4
     for name in names:
         inside = int((np.abs(pulls[name]) < stats.norm.ppf(0.975)).sum())
-        print(
-            f"{given} at {distances}: {name} in {inside} of {n}, r.m.s. {np.sqrt(np.mean(np.square(pulls[name]))):.2f}"
-        )
         assert inside >= stats.binom.ppf(1 - level, n, 0.95)
         # nor are they wider than need be: noise of 20 frames beside 5 mm, and scatter between three boards
         assert np.mean(np.square(pulls[name])) > 0.4
@@ -262,9 +260,8 @@ def test_frames_behind_a_filter_in_time_are_noticed():
 
 
 def test_a_range_beyond_the_wrap_has_an_error_about_zero():
-    fit = fitted(
-        PMD.with_(signal_e=5e6, range_offset_m=0.03), (14.95, 16.0), base=PMD, amplitude=False, intensity=False
-    )
+    bright = PMD.with_(signal_e=5e6, range_offset_m=0.03)
+    fit = fitted(bright, (14.95, 16.0), amplitude=False, intensity=False)
     assert fit.sensor.range_offset_m == pytest.approx(0.03, abs=0.005)
 
 
@@ -297,14 +294,10 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(frames, distances, albedo,
     assert "\n" not in str(caught.value)
 
 
-def test_frames_without_a_valid_pixel_are_refused():
-    with pytest.raises(UsageError, match="no pixel is valid"):
-        fit_sensor([Frames(np.full((20, 16, 16), np.nan), sensor=PMD)], [1.0], base=PMD)
-
-
-def test_one_frame_repeated_is_refused():
-    with pytest.raises(UsageError, match="no noise"):
-        fit_sensor([Frames(np.ones((20, 16, 16)), sensor=PMD)], [1.0], base=PMD)
+@pytest.mark.parametrize(("value", "message"), [(math.nan, "no pixel is valid"), (1.0, "no noise")])
+def test_frames_without_a_valid_pixel_and_one_frame_repeated_are_refused(value, message):
+    with pytest.raises(UsageError, match=message):
+        fit_sensor([Frames(np.full((20, 16, 16), value), sensor=PMD)], [1.0], base=PMD)
 
 
 # The command and its file
@@ -344,7 +337,6 @@ def test_the_command_writes_a_sensor_file_that_says_what_was_measured(folder, tm
         assert line.startswith("#") or not line or "  # measured" in line or "  # assumed: " in line
     assert main(["sensor", "show", str(out)]) == 0
     assert f"# {sources['signal_e']}" in capsys.readouterr().out
-    assert main(["sensor", "characterise", str(out), "-o", str(tmp_path / "sheet"), "--frames", "4"]) == 0
     assert run(*boards, "-o", out) == 4  # it exists
     assert "exists already" in capsys.readouterr().err
     assert run(*boards, "-o", out, "--force") == 0
@@ -366,22 +358,14 @@ def test_positions_of_one_file_take_their_distances_in_order(folder, tmp_path):
         (["short.csv", "--distance", "1"], 2, f"at least {FEWEST_FRAMES} are needed"),
         (["1.npz", "--distance", "-1"], 2, "must be a positive number of metres, got -1"),
         (["1.npz", "--distance", "near"], 2, "--distance"),
-        (
-            ["1.npz", "--distance", "1", "--distance-std", "5"],
-            2,
-            "'distance_std_m' must be a number of metres from 0 to",
-        ),
+        (["1.npz", "--distance", "1", "--distance-std", "5"], 2, "'distance_std_m' must be a number of metres from"),
         (["1.npz"], 2, "--distance"),
         (["1.npz", "2.npz", "--distance", "1"], 2, "each set of frames needs its distance"),
         (["narrow.csv", "--distance", "1"], 3, "12 values, must have 256"),
         (["empty.csv", "--distance", "1"], 2, "no pixel is valid"),
         (["missing.npz", "--distance", "1"], 3, "cannot be read"),
         (["1.npz", "--distance", "1", "--sensor", "nothing"], 2, "unknown sensor 'nothing'"),
-        (
-            ["1.npz", "--distance", "1", "--amplitude-unit", "volts"],
-            2,
-            "'volts' is not one of 'electrons', 'arbitrary'",
-        ),
+        (["1.npz", "--distance", "1", "--amplitude-unit", "volts"], 2, "'volts' is not one of 'electrons', 'arbitr"),
     ],
 )
 def test_the_command_says_in_one_line_what_is_wrong(folder, tmp_path, capsys, monkeypatch, arguments, code, part):

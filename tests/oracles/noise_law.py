@@ -16,7 +16,7 @@ FALSE_ALARM = 1e-3  # of a whole test, whatever the number of cells
 def noise_law_m(sensor: Sensor, amplitude: float, intensity: float) -> float:
     """The range noise law, written out a second time from PHYSICS section 4."""
     code_e = 0 if sensor.adc_bits is None else 1 / sensor.gain
-    shot = sensor.signal_e * intensity + sensor.ambient_e + sensor.dark_e
+    shot = sensor.shot_noise * (sensor.signal_e * intensity + sensor.ambient_e + sensor.dark_e)
     root = math.sqrt(shot + 2 * sensor.read_noise_e**2 + code_e**2 / 6)
     return 299_792_458 / (4 * math.pi * 10e6) * root / (math.sqrt(2) * sensor.contrast * sensor.signal_e * amplitude)
 
