@@ -41,6 +41,17 @@ def one_pixel(**fields: Any) -> Sensor:
     return Sensor(**{"rows": 1, "cols": 1, "half_angle_h_deg": 1, "half_angle_v_deg": 1, **fields})
 
 
+def measure_only(monkeypatch: pytest.MonkeyPatch, module: str, *names: str) -> None:
+    """Leave out the other measurements of a data sheet, of "phase" or "direct" sensors."""
+    measures = {
+        "phase": ("_photon_transfer", "_range_noise", "_linearity", "_patterns", "_saturation", "_threshold"),
+        "direct": ("_range", "_dropout", "_counts", "_merging", "_ambient"),
+    }
+    for name in measures[module]:
+        if name not in names:
+            monkeypatch.setattr(f"phasemark.render.bench.data_sheet.{module}.{name}", lambda *_: iter(()))
+
+
 def images_of(
     phasor: ArrayLike, intensity: ArrayLike, sensor: Sensor, harmonics: dict[int, NDArray[Any]] | None = None
 ) -> PhasorImages:
