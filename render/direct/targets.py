@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,6 @@ from numpy.typing import NDArray
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
-
-if TYPE_CHECKING:
-    from phasemark.render.direct.histogram_frames import HistogramFrames
 
 
 class Status(IntEnum):
@@ -47,7 +44,14 @@ class Targets(NamedTuple):
     status: NDArray[np.uint8]
 
 
-def find_targets(frames: HistogramFrames) -> Targets:
+class Counted(Protocol):
+    """Interface of objects with histograms: :class:`~phasemark.render.direct.HistogramFrames`."""
+
+    counts: NDArray[np.float64]
+    sensor: Sensor
+
+
+def find_targets(frames: Counted) -> Targets:
     """Run the chip's estimator on histograms.
 
     The ambient level is the median bin. Peaks are local maxima that rise above it by `threshold` standard deviations
