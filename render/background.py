@@ -170,41 +170,6 @@ def _extremes(
 
 
 @kernel
-def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
-
-    The ray starts at the lens in direction (dx, dy, dz) of the level camera frame, of any length; the multiple is 0
-    where nothing is met.
-    """
-    forward = dx * cos_b + dy * sin_b
-    t, albedo, facing = 0.0, 0.0, 0.0
-    if parameters[0] > 0.0 and forward > 0.0:
-        t, albedo, facing = parameters[0] / forward, parameters[2], forward
-    if parameters[1] > 0.0 and dz < 0.0:
-        floor = -parameters[1] / dz
-        if t == 0.0 or floor < t:
-            t, albedo, facing = floor, parameters[3], -dz
-    return t, albedo, facing
-
-
-@kernel
-def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
-    """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
-
-    The rays (1, y, z) are those of the tilted camera; parameters as for :func:`background_edge`, with a floor.
-    """
-    # points of the line satisfy normal · ray = 0 in the level frame
-    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
-    if parameters[0] == 0.0:
-        nx, ny, nz = 0.0, 0.0, 1.0
-    # the normal in the tilted frame
-    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
-    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
-    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
-    return tx, ty, tz
-
-
-@kernel
 def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return which plane a ray meets first: 1 the wall, 2 the floor, 0 neither; see :func:`background_hit`."""
     forward, plane, t = dx * cos_b + dy * sin_b, 0, 0.0
@@ -224,6 +189,34 @@ def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[n
     if plane == 2 and dz < 0.0:
         return -parameters[1] / dz, parameters[3], -dz
     return 0.0, 0.0, 0.0
+
+
+@kernel
+def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
+
+    The ray starts at the lens in direction (dx, dy, dz) of the level camera frame, of any length; the multiple is 0
+    where nothing is met.
+    """
+    plane = nearer_plane(parameters, cos_b, sin_b, dx, dy, dz)
+    return hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz)
+
+
+@kernel
+def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
+    """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
+
+    The rays (1, y, z) are those of the tilted camera; parameters as for :func:`background_edge`, with a floor.
+    """
+    # points of the line satisfy normal · ray = 0 in the level frame
+    nx, ny, nz = parameters[1] * cos_b, parameters[1] * sin_b, parameters[0]
+    if parameters[0] == 0.0:
+        nx, ny, nz = 0.0, 0.0, 1.0
+    # the normal in the tilted frame
+    tx = nx * level[0, 0] + ny * level[1, 0] + nz * level[2, 0]
+    ty = nx * level[0, 1] + ny * level[1, 1] + nz * level[2, 1]
+    tz = nx * level[0, 2] + ny * level[1, 2] + nz * level[2, 2]
+    return tx, ty, tz
 
 
 @kernel
