@@ -118,7 +118,7 @@ def test_the_oracle_integrates_pixels_alike_along_rows_and_along_columns(landmar
     name, view, planes = random_views(landmark, 1, 5)[0]
     sensor, behind = camera(name), Background(**planes)
     _, coverage = images_of(landmark, name, view, planes)
-    pixels = np.argwhere((coverage > 0.05) & (coverage < 0.95))[:8]
+    pixels = np.argwhere((coverage > 0.05) & (coverage < 0.95))[:3]
     along = [
         exact_pixels(
             landmark, sensor, Views.broadcast(*view), pixels, background=behind, along_v=along_v, parts=24, looks=384
@@ -138,8 +138,8 @@ def test_pixels_that_the_rules_once_missed_are_right_at_every_frequency(case):
 @pytest.mark.parametrize("landmark", catalog())
 def test_pixels_of_random_views_are_right_at_every_frequency(landmark):
     rng = np.random.default_rng(3)
-    for case in random_views(landmark, 3, 2):
-        error, pixel = worst_of(landmark, case, 16, rng)
+    for case in random_views(landmark, 2, 2):
+        error, pixel = worst_of(landmark, case, 10, rng)
         assert error <= EPSILON, (case, pixel)
 
 
@@ -153,13 +153,16 @@ def test_every_pixel_of_two_hundred_random_views_is_right_at_every_frequency(lan
     assert max(error for error, _, _ in worst) <= 1.5 * EPSILON, wrong
 
 
-@pytest.mark.parametrize("splits", [3, *(pytest.param(n, marks=pytest.mark.soak) for n in (2, 4))])
-def test_finer_boxes_do_not_make_pixels_beside_limbs_worse(splits):
+@pytest.mark.parametrize(
+    ("splits", "n_views", "n_pixels"),
+    [(3, 1, 5), *(pytest.param(splits, 2, 12, marks=pytest.mark.soak) for splits in (2, 3, 4))],
+)
+def test_finer_boxes_do_not_make_pixels_beside_limbs_worse(splits, n_views, n_pixels):
     rng = np.random.default_rng(6)
     for landmark in catalog():
-        for name, view, planes in random_views(landmark, 2, 9):
+        for name, view, planes in random_views(landmark, n_views, 9):
             phasors, coverage = images_of(landmark, name, view, planes, splits=splits)
             pixels = np.argwhere((coverage > 0) & (coverage < 1))
-            pixels = rng.permutation(pixels)[:12]
+            pixels = rng.permutation(pixels)[:n_pixels]
             error = errors(landmark, name, view, planes, pixels, phasors, parts=16, tolerance=2e-7)
             assert error.max() <= EPSILON, (landmark, name, view, planes)

@@ -38,16 +38,15 @@ def errors(mesh, view, splits=1, **options):
     ).max()
 
 
-@pytest.mark.parametrize("name", ["star prism", "hidden box"])
-def test_flat_faces_that_hide_each_other_agree_with_a_quadtree(name):
-    epsilon, coverage = errors(ODD[name](), random_views(np.random.default_rng(3), 1), last=9)
+def test_flat_faces_that_hide_each_other_agree_with_a_quadtree():
+    epsilon, coverage = errors(ODD["hidden box"](), random_views(np.random.default_rng(3), 1), last=9)
     assert epsilon < 1e-4
     assert coverage < 1e-4
 
 
 def test_bumps_finer_than_a_pixel_take_more_splits():
     mesh, view = lump(subdivisions=5), Views.broadcast(1.929, 0.254, 0.0316, 0.0044)
-    phasor, _, _ = adaptive_images(Renderer(mesh, PMD), view)
+    phasor, _, _ = adaptive_images(Renderer(mesh, PMD), view, tolerance=3e-5, last=8)
 
     def epsilon(splits):
         return np.abs(Renderer(mesh, PMD, splits=splits).render_views(view).phasor[0] - phasor).max()
