@@ -24,7 +24,7 @@ demo: $(VENV)/.installed
 	$(BIN)/phasemark demo --out out/demo --force
 
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist loadfile -m "not soak and not docs" $(ARGS)
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not soak and not docs" $(ARGS)
 
 soak: $(VENV)/.installed-test
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m soak $(ARGS)

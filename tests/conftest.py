@@ -23,6 +23,21 @@ os.environ["PHASEMARK_COMPILE_NOTES"] = "0"
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+_LONGEST = {
+    f"test_{name}.py"
+    for name in (
+        "calibrate", "design", "direct_pose", "drive", "frequency_matching", "histogram_backgrounds", "histogram_joint",
+        "histogram_matching", "lens_calibration", "recordings", "refine", "region", "sweep_report",
+    )
+}  # fmt: skip
+"""Files of tests that take longest. They go first: a worker that began one of them last would work alone."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files that take longest before all others, each file's tests in their order."""
+    items.sort(key=lambda item: item.path.name not in _LONGEST)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Compile once for all test processes: this runs in the one that starts them, too."""
     if not config.getoption("numprocesses", None) or config.option.collectonly:
