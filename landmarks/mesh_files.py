@@ -136,12 +136,9 @@ def read_mesh(
     MeshWarning
         The mesh is open or inside out; it is rendered two-sided.
     """
-    if up not in _UP:
-        raise UsageError(f"'up' must be one of {', '.join(_UP)}, got {up!r}")
-    if origin not in ORIGINS:
-        raise UsageError(f"'origin' must be one of {', '.join(ORIGINS)}, got {origin!r}")
-    if unit is not None and unit not in METRES_PER_UNIT:
-        raise UsageError(f"'unit' must be one of {', '.join(METRES_PER_UNIT)}, got {unit!r}")
+    for option, value, known in (("up", up, _UP), ("origin", origin, ORIGINS), ("unit", unit, METRES_PER_UNIT)):
+        if value not in known and (option != "unit" or value is not None):
+            raise UsageError(f"'{option}' must be one of {', '.join(known)}, got {value!r}")
     if isinstance(source, bytes):
         name, content = "mesh", source
     else:
@@ -305,11 +302,8 @@ def _check_stl(content: bytes, name: str) -> None:
         return
     if content.lstrip()[:5].lower() == b"solid":
         text = content.lower()
-        facets, loops, corners = (
-            text.count(b"facet normal"),
-            text.count(b"endfacet"),
-            len(re.findall(rb"\bvertex\s", text)),
-        )
+        facets, loops = text.count(b"facet normal"), text.count(b"endfacet")
+        corners = len(re.findall(rb"\bvertex\s", text))
         if not facets:
             raise InputFileError(f"{name}: has no faces")
         if loops != facets or corners != 3 * facets or b"endsolid" not in text:

@@ -66,11 +66,8 @@ def kalman_step(
     if x.ndim != 1 or z.ndim != 1:
         raise UsageError(f"'x' and 'z' must be vectors, got shapes {x.shape} and {z.shape}")
     n_state, n_measured = len(x), len(z)
-    P = _matrix("P", P, (n_state, n_state))
-    A = _matrix("A", A, (n_state, n_state))
-    H = _matrix("H", H, (n_measured, n_state))
-    Q = _matrix("Q", Q, (n_state, n_state))
-    R = _matrix("R", R, (n_measured, n_measured))
+    P, A, Q = (_matrix(name, square, (n_state, n_state)) for name, square in (("P", P), ("A", A), ("Q", Q)))
+    H, R = _matrix("H", H, (n_measured, n_state)), _matrix("R", R, (n_measured, n_measured))
     if (B is None) != (u is None):
         raise UsageError("'B' and 'u' go together: give both or neither")
     x_prior = A @ x
