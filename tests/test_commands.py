@@ -108,7 +108,6 @@ sensor = "vl53l5cx-8x8"
 variants = ["mixed"]
 wall_m = { normal = [3.8, 0.1], within = [3.0, 4.1] }
 """
-RANGES_ALONE = FAR_FRAMES + "histograms = false\n"
 FAR_HISTOGRAMS = FAR_FRAMES.replace("4.1", "4.9")
 FAR_SWEEP = """
 name = "far"
@@ -117,41 +116,27 @@ axes = { distance_m = [16.0], wall_m = [0.0, 18.0] }
 """
 
 
+NO_RANGE = "'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports no range from there"
+BUILD = "frames build plan.toml --dry-run -o f.h5"
+
+
 @pytest.mark.parametrize(
-    ("text", "arguments", "notes"),
+    ("text", "command", "notes"),
     [
-        (
-            None,
-            ["render", "--class", "cone", "--distance", "20", "-o", "x.png"],
-            [f"--distance at 20 m {WRAPS} 5.01 m"],
-        ),
-        (None, ["render", "--class", "cone", "--wall", "16", "-o", "x.png"], [f"--wall at 16 m {WRAPS} 1.01 m"]),
-        (None, ["render", "--class", "cone", "--wall", "14.9", "-o", "x.png"], []),
-        (
-            None,
-            ["bank", "build", "--distance", "14:20:2", "--dry-run", "-o", "b.h5"],
-            [f"'distance_m' at 20 m {WRAPS} 5.01 m"],
-        ),
-        (
-            RANGES_ALONE,
-            ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"],
-            ["'wall_m' at 4.1 m is beyond the sensor's 'max_range_m' = 4 m: the sensor reports no range from there"],
-        ),
-        # targets of histograms are found as far as their bins reach, 128 of 3.75 cm
-        (FAR_FRAMES, ["frames", "build", "plan.toml", "--dry-run", "-o", "f.h5"], []),
-        (
-            FAR_HISTOGRAMS,
-            ["plan", "check", "plan.toml"],
-            ["'wall_m' at 4.9 m is beyond the histograms, which end at 4.8 m"],
-        ),
-        (FAR_SWEEP, ["plan", "check", "plan.toml"], ["axes.distance_m", "axes.wall_m", "bank_distance_m"]),
+        (None, "render --class cone --distance 20 -o x.png", [f"--distance at 20 m {WRAPS} 5.01 m"]),
+        (None, "render --class cone --wall 16 -o x.png", [f"--wall at 16 m {WRAPS} 1.01 m"]),
+        (None, "render --class cone --wall 14.9 -o x.png", []),
+        (None, "bank build --distance 14:20:2 --dry-run -o b.h5", [f"'distance_m' at 20 m {WRAPS} 5.01 m"]),
+        (FAR_FRAMES + "histograms = false\n", BUILD, [NO_RANGE]),
+        (FAR_FRAMES, BUILD, []),  # targets of histograms are found as far as their bins reach, 128 of 3.75 cm
+        (FAR_HISTOGRAMS, "plan check plan.toml", ["'wall_m' at 4.9 m is beyond the histograms, which end at 4.8 m"]),
+        (FAR_SWEEP, "plan check plan.toml", ["axes.distance_m", "axes.wall_m", "bank_distance_m"]),
     ],
 )
-def test_distances_that_wrap_or_return_nothing_are_noted(run, tmp_path, monkeypatch, text, arguments, notes):
+def test_distances_that_wrap_or_return_nothing_are_noted(run, tmp_path, monkeypatch, text, command, notes):
     monkeypatch.chdir(tmp_path)
-    if text is not None:
-        (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
-    code, _, err = run(*arguments)
+    (tmp_path / "plan.toml").write_text(text or "", encoding="utf-8")
+    code, _, err = run(*command.split())
     assert code == 0
     lines = err.splitlines()
     assert len(lines) == len(notes)
@@ -168,27 +153,21 @@ layout = "full"
 
 
 @pytest.mark.parametrize(
-    ("text", "arguments", "words"),
+    ("text", "command", "words"),
     [
         # 4 classes, 141 distances, 180 sides; a phasor, an intensity and a coverage of 4 bytes a number
-        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5"], ["101520 images, 499 GB", "2 GB", "--max-size 549GB"]),
-        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--shard", "1/1000", "--max-size", "498MB"], ["101 images"]),
-        (VGA, ["bank", "build", "plan.toml", "-o", "x.h5", "--distance", "1:9:0.0001", "--delta", "0:9:1e-4"], ["TB"]),
-        (
-            "views = 1000000000",
-            ["frames", "build", "plan.toml", "-o", "x.h5"],
-            ["1000000000 views, 1000000000 frames, 6.49 TB", "'views'"],
-        ),
-        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "6kB"], ["6.49 kB", "6 kB"]),
-        ("views = 1", ["frames", "build", "plan.toml", "-o", "x.h5", "--max-size", "20 apples"], ["such as 20GB"]),
+        (VGA, "bank build", ["101520 images, 499 GB", "2 GB", "--max-size 549GB"]),
+        (VGA, "bank build --shard 1/1000 --max-size 498MB", ["101 images"]),
+        (VGA, "bank build --distance 1:9:0.0001 --delta 0:9:1e-4", ["TB"]),
+        ("views = 1000000000", "frames build", ["1000000000 views, 1000000000 frames, 6.49 TB", "'views'"]),
+        ("views = 1", "frames build --max-size 6kB", ["6.49 kB", "6 kB"]),
+        ("views = 1", "frames build --max-size 20apples", ["such as 20GB"]),
     ],
 )
-def test_a_file_that_would_be_too_large_is_refused_before_it_is_begun(
-    run, tmp_path, monkeypatch, text, arguments, words
-):
+def test_a_file_that_would_be_too_large_is_refused_before_it_is_begun(run, tmp_path, monkeypatch, text, command, words):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "plan.toml").write_text(text, encoding="utf-8")
-    code, out, err = run(*arguments)
+    code, out, err = run(*command.split(), "plan.toml", "-o", "x.h5")
     assert (code, out) == (2, "")
     assert err.startswith("error: ")
     assert err.count("\n") == 1

@@ -289,14 +289,12 @@ def plain(range_m, sensor, amplitude=0.5):
     distance = np.broadcast_to(np.asarray(range_m, float), (1, sensor.rows, sensor.cols))
     first_hz, *others = sensor.frequencies_hz
     s = {hz: amplitude * np.exp(4j * math.pi * hz / C * distance) for hz in sensor.frequencies_hz}
-    return PhasorImages(
-        s[first_hz],
+    light, coverage, others_by_hz = (
         np.full(distance.shape, amplitude),
         np.ones(distance.shape),
-        sensor,
-        Views.broadcast(1.0),
-        by_hz={hz: s[hz] for hz in others},
+        {hz: s[hz] for hz in others},
     )
+    return PhasorImages(s[first_hz], light, coverage, sensor, Views.broadcast(1.0), by_hz=others_by_hz)
 
 
 def take(image, sensor, seed=1, n_frames=1, **options):
@@ -308,12 +306,8 @@ def test_each_frequency_has_the_noise_of_the_law_and_none_of_the_others():
     frames = take(plain(3.2, sensor), sensor, n_frames=200)
     phases = []
     for hz, part in zip(sensor.frequencies_hz, frames.by_frequency, strict=True):
-        law = (
-            C
-            / (4 * math.pi * hz)
-            * math.sqrt(sensor.signal_e * 0.5 + 3000 + 2 * 400)
-            / (math.sqrt(2) * 0.5 * sensor.signal_e * 0.5)
-        )
+        std_rad = math.sqrt(sensor.signal_e * 0.5 + 3000 + 2 * 400) / (math.sqrt(2) * 0.5 * sensor.signal_e * 0.5)
+        law = C / (4 * math.pi * hz) * std_rad
         error = wrapped(part.range_m.ravel() - 3.2 % part.sensor.unambiguous_range_m, part.sensor)
         low, high = stats.chi2.interval(1 - 0.001 / 4, error.size)  # 99.9 %, four cells
         assert low <= np.sum(error**2) / law**2 <= high
@@ -334,18 +328,13 @@ def test_the_range_of_a_frame_has_the_combined_variance():
     assert low <= flagged.size <= high
 
 
-def test_one_frequency_keeps_the_noise_it_has_alone():
+def test_one_frequency_keeps_the_noise_it_has_alone_and_a_run_its_bytes_piece_by_piece():
     alone = PMD.with_(modulation_hz=20e6)
-    frames = take(plain(3.0, TWO), TWO, n_frames=3)
-    single = take(plain(3.0, alone), alone, n_frames=3)
+    frames, single = (take(plain(3.0, sensor), sensor, n_frames=4) for sensor in (TWO, alone))
     np.testing.assert_array_equal(frames.by_frequency[0].range_m, single.range_m)
     np.testing.assert_array_equal(frames.amplitude_e, single.amplitude_e)
-
-
-def test_a_run_captured_piece_by_piece_has_the_same_bytes():
-    whole = take(plain(3.0, TWO), TWO, n_frames=4)
     part = take(plain(3.0, TWO), TWO, n_frames=2, first_frame=2)
-    np.testing.assert_array_equal(whole.range_m[:, 2:], part.range_m)
+    np.testing.assert_array_equal(frames.range_m[:, 2:], part.range_m)
 
 
 def test_taps_are_kept_in_the_order_of_the_phase_images():
