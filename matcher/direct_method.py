@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.estimate.acceptance import Rules, with_parts
-from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher, check_histogram_sensor, refuse_other_sensor
+from phasemark.matcher.histograms.direct_matcher import check_histogram_sensor, refuse_other_sensor
+from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import usual_workers

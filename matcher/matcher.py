@@ -25,7 +25,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
-from phasemark.matcher.histograms.joint_models import relative_poses
+from phasemark.matcher.histograms.scene_models import relative_poses
 from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import (

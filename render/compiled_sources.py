@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 _FOLDERS = {
     "matcher": "pixel_agreement",
     "matcher/filters": "loops",
-    "matcher/histograms": "background_search histogram_table poisson_fit table_search target_matcher",
+    "matcher/histograms": "histogram_table poisson_fit table_search target_costs",
     "matcher/likelihood": "bank_images residuals strip_images",
     "matcher/nearest": "bank_minima cells search templates",
     "render": "background compile_cache kernel unwrapping",

@@ -3,84 +3,67 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 
 import numpy as np
 import pytest
 import trimesh
-from scipy.stats import binom, chi2, kstest, norm, poisson
+from direct_landmarks import (
+    CLASSES,
+    FREE,
+    SENSOR,
+    bank_of,
+    check_bound,
+    frames_of,
+    matcher_of,
+    random_views,
+    renderer_of,
+    right_answers,
+    trials,
+)
+from oracles.simple_scenes import block_on_table, poses_around
+from scipy.stats import binom, chi2, kstest, poisson
 
 from phasemark import UsageError
-from phasemark.data import Bank, BankPlan, build_bank
+from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.direct_method import Measured
 from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
+from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.statistics import nees, view_errors
-from phasemark.render import Background, Frames, Sensor, Views, preset
+from phasemark.render import Background, Frames, Views, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
 from phasemark.render.direct.bin_counts import detected_counts, piled_up, signal_counts
 from phasemark.render.direct.expected_targets import expected_targets
 from phasemark.render.direct.footprints import footprint_grid
+from phasemark.render.direct.recordings import world2cam
 from phasemark.render.direct.sample_counts import signal_of_samples
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
 from phasemark.render.view import VIEW_FIELDS
 
-SENSOR = "vl53l5cx-8x8"
-CLASSES = ("cylinder", "cone", "sphere")
-FREE = ("distance_m", "delta_rad")
 
-
-@lru_cache(maxsize=4)
-def bank_of(sensor: str = SENSOR, span: str = "0.95:1.25:0.1", classes: tuple[str, ...] = CLASSES) -> Bank:
-    return build_bank(
-        BankPlan(sensor=sensor, classes=classes, distance_m=span, delta_deg="0:170:10", layout="full"), workers=1
-    )
-
-
-@lru_cache(maxsize=8)
-def renderer_of(name: str, sensor: Sensor) -> HistogramRenderer:
-    return HistogramRenderer(build_mesh(catalog()[name]), sensor, albedo=catalog()[name].albedo)
-
-
-@lru_cache(maxsize=4)
-def matcher_of(free: tuple[str, ...] | None = FREE, on: Measured = "histograms", sensor: str = SENSOR) -> Matcher:
-    return Matcher(bank_of(sensor), "refine", free=free, on=on, workers=1)
-
-
-def random_views(n: int, rng: np.random.Generator) -> Views:
-    return Views.broadcast(rng.uniform(1.0, 1.2, n), rng.uniform(0, np.pi, n))
-
-
-def frames_of(name: str, views: Views, rng: np.random.Generator, n_frames: int = 1) -> HistogramFrames:
-    sensor = bank_of().camera
-    return capture_histograms(renderer_of(name, sensor).expected(views), sensor, rng=rng, n_frames=n_frames)
-
-
-@pytest.mark.parametrize("name", ["vl53l5cx-8x8", "tmf8820-3x3"])
-def test_counts_of_samples_are_those_of_their_transients(name: str) -> None:
-    sensor = preset(name)
-    histogram = sensor.histogram.model_dump()
-    if name == "tmf8820-3x3":  # each zone has a response, a bin width and a gain of its own
-        x = np.arange(-20, 41) * 0.002
-        rows = [tuple(np.exp(-0.5 * (x / (0.012 + 0.001 * k)) ** 2).tolist()) for k in range(9)]
-        scale = ((1.0, 1.02, 0.98),) * 3
-        gain = ((1.0, 0.9, 1.1),) * 3
-        histogram |= {
-            "irf_std_m": None, "irf": rows, "irf_start_m": float(x[0]), "irf_step_m": 0.002, "zone_bin_scale": scale,
-            "zone_gain": gain,
-        }  # fmt: skip
-        sensor = sensor.with_(histogram=histogram)
-    axis = range_axis(sensor)
-    views = Views.broadcast([0.7, 1.0], [0.3, 1.0])
-    samples = SceneMesh(build_mesh(catalog()["cone"])).samples_of_views(views, footprint_grid(sensor))
-    want = signal_counts(zone_transients(samples, sensor, axis), sensor, axis, 0.5)
-    got = signal_of_samples(samples, sensor, 0.5)
-    assert np.abs(got - want).max() < 5e-5 * want.max()  # linear steps of the response, 1/64 of its width
+def test_counts_of_samples_are_those_of_their_transients() -> None:
+    tmf = preset("tmf8820-3x3")
+    x = np.arange(-20, 41) * 0.002  # each zone has a response, a bin width and a gain of its own
+    rows = [tuple(np.exp(-0.5 * (x / (0.012 + 0.001 * k)) ** 2).tolist()) for k in range(9)]
+    own = {
+        "irf_std_m": None, "irf": rows, "irf_start_m": float(x[0]), "irf_step_m": 0.002,
+        "zone_bin_scale": ((1.0, 1.02, 0.98),) * 3, "zone_gain": ((1.0, 0.9, 1.1),) * 3,
+    }  # fmt: skip
+    views, poses = Views.broadcast([0.7, 1.0], [0.3, 1.0]), world2cam(poses_around(2))
+    for sensor, mesh, albedo in (
+        (preset(SENSOR), build_mesh(catalog()["cone"]), 0.5),
+        (tmf.with_(histogram={**tmf.histogram.model_dump(), **own}), block_on_table(), (0.3, 0.5)),  # table and block
+    ):
+        axis, scene, grid = range_axis(sensor), SceneMesh(mesh), footprint_grid(sensor)
+        samples = scene.samples_of_views(views, grid) if isinstance(albedo, float) else scene.samples(poses, grid)
+        want = signal_counts(zone_transients(samples, sensor, axis), sensor, axis, albedo)
+        got = signal_of_samples(samples, sensor, albedo)
+        assert np.abs(got - want).max() < 5e-5 * want.max()  # linear steps of the response, 1/64 of its width
 
 
 def test_deviance_of_a_poisson_count_has_its_closed_forms() -> None:
@@ -136,43 +119,17 @@ def test_gradient_and_information_are_those_of_the_piled_up_likelihood() -> None
     np.testing.assert_allclose(gradient, want[:2] - cross @ inner @ want[2:], rtol=1e-5)
 
 
-def errors_over_bound(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
-    """Return RMSE over bound, NEES of each right answer, p-values, and the share that is right."""
-    rng = np.random.default_rng(seed)
-    scaled, squares, p_values, right = [], [], [], 0
-    for name in CLASSES:
-        views = random_views(n // len(CLASSES), rng)
-        found = matcher_of().match(frames_of(name, views, rng))
-        error = view_errors(found, views, FREE, np.pi)
-        ok = (found.class_name == name) & (np.abs(error) < [0.03, math.radians(6)]).all(axis=1)
-        wrong = found.accepted & ~ok
-        assert not wrong.any(), (name, views[np.flatnonzero(wrong)])
-        bound = cramer_rao(renderer_of(name, bank_of().camera), views, n_frames=1).covariance
-        scaled.append((error / np.sqrt(np.einsum("npp->np", bound)))[ok])
-        squares.append(nees(error[ok], found.covariance[ok]))
-        p_values.append(found.p_value[ok])
-        right += int(ok.sum())
-    ratio = np.sqrt((np.concatenate(scaled) ** 2).mean(axis=0))
-    return ratio, np.concatenate(squares), np.concatenate(p_values), right / (n // len(CLASSES) * len(CLASSES))
-
-
 def test_error_is_at_the_poisson_bound_and_the_covariance_is_honest() -> None:
-    n = 150
-    ratio, squares, p_values, right = errors_over_bound(n, seed=3)
-    assert right > 0.97
-    half = norm.isf(0.0005 / 4) / math.sqrt(2 * n)  # of a root mean square
-    assert (np.abs(ratio - 1) < half + 0.02).all()  # 0.02: slopes change over a standard deviation
-    assert abs(squares.mean() / 2 - 1) < norm.isf(0.0005 / 4) / math.sqrt(n) + 0.03
-    assert (p_values < 0.01).sum() <= binom.isf(1e-4, len(p_values), 0.01)
+    check_bound(trials(150, seed=3), slack=0.02)
 
 
 @pytest.mark.soak
 def test_error_over_bound_and_nees_hold_their_bars_in_5000_trials_of_histograms() -> None:
-    ratio, squares, p_values, right = errors_over_bound(5000, seed=4)
-    assert ((ratio > 0.97) & (ratio < 1.05)).all(), ratio
-    assert 0.97 < squares.mean() / 2 < 1.05
-    assert (p_values < 0.01).mean() < 0.015
-    assert right > 0.97
+    found = trials(5000, seed=4)
+    assert ((found.ratio > 0.97) & (found.ratio < 1.05)).all(), found.ratio
+    assert 0.97 < found.squares.mean() / 2 < 1.05
+    assert (found.p_values < 0.01).mean() < 0.015
+    assert len(found.squares) > 0.97 * found.n
 
 
 def test_brightness_and_ambient_light_that_the_sensor_file_does_not_know_cost_nothing() -> None:
@@ -192,7 +149,7 @@ def test_brightness_and_ambient_light_that_the_sensor_file_does_not_know_cost_no
 def test_the_bearing_is_estimated_unless_the_matcher_is_told_and_lies_within_its_errors() -> None:
     rng = np.random.default_rng(7)
     views = Views.broadcast(1.1, rng.uniform(0, np.pi, 9), np.radians(rng.normal(0, 1.5, 9)))
-    found = matcher_of(None).match(frames_of("cylinder", views, rng))
+    found = matcher_of(free=None).match(frames_of("cylinder", views, rng))
     assert found.free == ("distance_m", "delta_rad", "bearing_rad")
     error = view_errors(found, views, found.free, np.pi)
     assert (found.class_name == "cylinder").sum() >= 8
@@ -285,21 +242,6 @@ def test_jitter_of_stamps_counts_as_motion_of_a_sensor_that_moves() -> None:
     np.testing.assert_allclose(part, (0.5 * jitter_s) ** 2, rtol=0.2)  # a speed from four distances
 
 
-@pytest.mark.parametrize("on", ["histograms", "targets"])
-@pytest.mark.parametrize(
-    ("option", "message"),
-    [
-        ({"policy": SearchPolicy()}, "'policy' must be None"),
-        ({"systematic": ("declared", "calibration")}, "'systematic' must be without 'calibration'"),
-    ],
-)
-def test_an_option_without_effect_is_refused(on: Measured, option: dict[str, object], message: str) -> None:
-    with pytest.raises(UsageError, match=message):
-        Matcher(bank_of(), "refine", on=on, **option)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="'systematic' and 'policy' belong to method 'refine', not 'nearest'"):
-        Matcher(bank_of(), **option)  # type: ignore[arg-type]
-
-
 def test_a_landmark_beyond_the_bank_is_not_accepted() -> None:
     views = Views.broadcast([1.27, 1.28, 1.30], [0.4, 0.9, 1.4])  # the bank ends at 1.25 m
     found = matcher_of().match(frames_of("cone", views, np.random.default_rng(16), n_frames=4))
@@ -344,16 +286,12 @@ def test_information_is_that_of_the_slowest_rise_of_the_cost() -> None:
 
 def targets_over_covariance(n: int, seed: int) -> np.ndarray:
     """Return the NEES of the right answers from targets; none that is accepted is wrong."""
-    rng = np.random.default_rng(seed)
-    matcher = matcher_of(on="targets")
-    squares = []
+    rng, squares = np.random.default_rng(seed), []
     for name in CLASSES:
         views = random_views(n // len(CLASSES), rng)
-        found = matcher.match(frames_of(name, views, rng).targets)
-        error = view_errors(found, views, FREE, np.pi)
-        right = (found.class_name == name) & (np.abs(error) < [0.03, math.radians(10)]).all(axis=1)
-        assert right[found.accepted].all()
-        squares.append(nees(error[right], found.covariance[right]))
+        found = matcher_of(on="targets").match(frames_of(name, views, rng).targets)
+        right = right_answers(found, name, views, farthest_deg=10)
+        squares.append(nees(view_errors(found, views, FREE, np.pi)[right], found.covariance[right]))
     return np.concatenate(squares)
 
 
@@ -424,49 +362,49 @@ def test_no_target_at_all_is_no_landmark() -> None:
     assert found[0].class_name is None
 
 
+@pytest.mark.parametrize(
+    ("on", "options", "message"),
+    [
+        ("histograms", {"method": "nearest"}, "'method' must be refine"),
+        ("targets", {"background": "auto"}, "'background' must be a Background or None"),
+        ("histograms", {"background": "unknown"}, "'background' must be a Background, 'auto' or None"),
+        ("histograms", {"robust": True}, "'robust' must be False"),
+        ("histograms", {"policy": SearchPolicy()}, "'policy' must be None"),
+        ("targets", {"policy": SearchPolicy()}, "'policy' must be None"),
+        ("histograms", {"systematic": ("declared", "calibration")}, "'systematic' must be without 'calibration'"),
+        ("targets", {"systematic": ("declared", "calibration")}, "'systematic' must be without 'calibration'"),
+    ],
+)
+def test_an_option_without_effect_is_refused(on: Measured, options: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=rf'^on="{on}": {message}'):
+        Matcher(bank_of(), **{"method": "refine", "on": on, **options})  # type: ignore[arg-type]
+    if options.keys() & {"policy", "systematic"}:
+        with pytest.raises(UsageError, match="'systematic' and 'policy' belong to method 'refine', not 'nearest'"):
+            Matcher(bank_of(), **options)  # type: ignore[arg-type]
+
+
 def test_what_does_not_go_with_histograms_is_refused_in_one_line() -> None:
-    bank, phase = bank_of(), bank_of("pmd-16x16", "1.0:1.1:0.1", ("cone",))
-    with pytest.raises(
-        UsageError, match=r"^histograms and targets take a bank of a direct sensor.*'pmd-16x16' is a phase"
-    ):
-        Matcher(phase, "refine", on="histograms")
-    with pytest.raises(UsageError, match=r"^on=\"histograms\": 'method' must be refine"):
-        Matcher(bank, on="histograms")
-    with pytest.raises(UsageError, match=r"^on=\"targets\": 'background' must be a Background or None"):
-        Matcher(bank, "refine", on="targets", background="auto")
-    with pytest.raises(UsageError, match=r"^on=\"histograms\": 'background' must be a Background, 'auto' or None"):
-        Matcher(bank, "refine", on="histograms", background="unknown")
-    with pytest.raises(UsageError, match=r"^on=\"histograms\": 'robust'"):
-        Matcher(bank, "refine", on="histograms", robust=True)
-    frames = HistogramFrames(np.ones((1, 1, 8, 8, 128)), sensor=bank.camera)
-    with pytest.raises(UsageError, match=r"^on=\"ranges\" takes filtered frames"):
-        Matcher(bank, "refine", free=FREE).match(frames)
-    filtered = kalman_filter(Frames(np.ones((1, 1, 8, 8)), sensor=bank.camera))
-    with pytest.raises(UsageError, match=r"^on=\"histograms\" takes HistogramFrames, got FilteredFrames"):
-        matcher_of().match(filtered)
+    bank, ones, none = bank_of(), np.ones((1, 1, 8, 8)), np.full((1, 1, 4, 4, 1), np.nan)
+    phase = build_bank(BankPlan(classes=("cone",), distance_m="1.0", delta_deg="0"))
+    filtered = kalman_filter(Frames(ones, sensor=bank.camera))
     other = bank.camera.with_(histogram={**bank.camera.histogram.model_dump(), "photons": 0.5})
-    with pytest.raises(UsageError, match=r"another sensor than the bank's: 'histogram.photons' is 0.5 here"):
-        matcher_of().match(HistogramFrames(np.ones((1, 1, 8, 8, 128)), sensor=other))
-    none = np.full((1, 1, 4, 4, 1), np.nan)
-    with pytest.raises(UsageError, match=r"^the targets are of 4 × 4 zones"):
-        matcher_of(on="targets").match(Targets(none, none, none, none))
-    with pytest.raises(UsageError, match="of histograms all zones count"):
-        cramer_rao(renderer_of("cone", bank.camera), Views.broadcast(1.0), pixels="lower")
-    with pytest.raises(UsageError, match="a wall can be a nuisance only where there is one"):
-        cramer_rao(renderer_of("cone", bank.camera), Views.broadcast(1.0), nuisances=("wall_m",))
+    frames = [HistogramFrames(np.ones((1, 1, 8, 8, 128)), sensor=sensor) for sensor in (bank.camera, other)]
+    cone, view = renderer_of("cone", bank.camera), Views.broadcast(1.0)
+    for call, message in (
+        (lambda: Matcher(phase, "refine", on="histograms"), "^histograms and targets take a bank of a direct.* phase"),
+        (lambda: Matcher(bank, "refine", free=FREE).match(frames[0]), '^on="ranges" takes filtered frames'),
+        (lambda: matcher_of().match(filtered), '^on="histograms" takes HistogramFrames, got FilteredFrames'),
+        (lambda: matcher_of().match(frames[1]), "another sensor than the bank's: 'histogram.photons' is 0.5 here"),
+        (lambda: matcher_of(on="targets").match(Targets(none, none, none, none)), "^the targets are of 4 × 4 zones"),
+        (lambda: cramer_rao(cone, view, pixels="lower"), "of histograms all zones count"),
+        (lambda: cramer_rao(cone, view, nuisances=("wall_m",)), "a wall can be a nuisance only where there is one"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            call()
 
 
 def test_the_table_states_its_size_before_it_is_made() -> None:
-    from phasemark.matcher.histograms.alone_search import AloneSearch
-    from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
-    from phasemark.matcher.histograms.plane_search import PlaneSearch
-
-    direct = matcher_of()._direct
-    assert isinstance(direct, HistogramMatcher)
-    assert isinstance(direct.search, AloneSearch)
-    assert matcher_of().table_bytes == sum(table.n_bytes for table in direct.search.tables)
-    before = Matcher(bank_of(), "refine", free=FREE, on="histograms", background=Background(wall_m=1.6), workers=2)
-    direct = before._direct
-    assert isinstance(direct, HistogramMatcher)
-    assert isinstance(direct.search, PlaneSearch)
-    assert before.table_bytes == sum(one.table.n_bytes + one.visible.nbytes for one in direct.search.tables)
+    for background in (None, Background(wall_m=1.6)):
+        direct = matcher_of(background)._direct
+        assert isinstance(direct, HistogramMatcher)
+        assert direct.table_bytes == sum(table.n_bytes for table in direct.tables)

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.histograms.histogram_matcher import glass_counts
-from phasemark.matcher.histograms.poisson_fit import frame_sums
-from phasemark.matcher.histograms.scene_models import FLOOR, WALL, planes_of
+from phasemark.matcher.histograms.direct_matcher import glass_counts
+from phasemark.matcher.histograms.poisson_fit import sums_of_frame
+from phasemark.matcher.histograms.scene_models import FLOOR, WALL, WALL_STEP_M, planes_of
 from phasemark.matcher.information import eliminated
 from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import histogram_of
@@ -20,7 +20,6 @@ from phasemark.render.direct.histogram_images import HistogramRenderer
 from phasemark.render.direct.view_signals import STEPS
 
 _ALBEDOS = {WALL: "wall_albedo", FLOOR: "floor_albedo"}
-_WALL_STEP_M = 2e-3
 
 
 def histogram_information(
@@ -61,7 +60,7 @@ def histogram_information(
     if frames.ndim > 1 or (frames.ndim == 1 and len(frames) not in (1, len(views))):
         raise UsageError(f"'n_frames' of histograms must be one number, or one for each view, got shape {frames.shape}")
     frames = np.broadcast_to(frames, (len(views),))
-    sensor, histogram, p = renderer.sensor, histogram_of(renderer.sensor), len(free)
+    sensor, histogram = renderer.sensor, histogram_of(renderer.sensor)
 
     def signal(at: Views, behind: Background | None = background) -> NDArray[np.float64]:
         found = renderer.signal(at, background=behind, workers=workers)
@@ -72,28 +71,21 @@ def histogram_information(
     for name in free:
         sides = [signal(replace(views, **{name: getattr(views, name) + step})) for step in (STEPS[name], -STEPS[name])]
         columns.append((sides[0] - sides[1]) / (2 * STEPS[name]))
-    planes = () if background is None else planes_of(background)
-    for plane in planes:
+    for plane in planes_of(background):
         assert background is not None
         others = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
         columns.append(renderer.signal(views, background=replace(background, **others), workers=workers)[:, 1])
     if free_wall:
         assert background is not None
         assert background.wall_m is not None
-        walls = [replace(background, wall_m=background.wall_m + step) for step in (_WALL_STEP_M, -_WALL_STEP_M)]
-        columns.append((signal(views, walls[0]) - signal(views, walls[1])) / (2 * _WALL_STEP_M))
+        walls = [replace(background, wall_m=background.wall_m + step) for step in (WALL_STEP_M, -WALL_STEP_M)]
+        columns.append((signal(views, walls[0]) - signal(views, walls[1])) / (2 * WALL_STEP_M))
     slopes = np.stack(columns, axis=1)
-    q = len(columns)
-    out = np.empty((len(views), p, p))
     zones, bins = here.shape[1:]
-    level, own, scratch = np.empty((zones, bins)), np.empty((zones, q + 3)), np.empty((2, q + 2))
-    whole, gradient = np.empty((q + 1, q + 1)), np.empty(q + 1)
+    whole = np.empty((len(views), len(columns) + 1, len(columns) + 1))
     for k, n in enumerate(frames):
         ambient = np.full(zones, n * histogram.cycles * (histogram.ambient + histogram.dark))
         cycles = n * histogram.cycles if histogram.pile_up else math.inf
-        frame_sums(
-            np.zeros((zones, bins)), n * here[k], n * slopes[k], 1.0, ambient, n * glass_counts(sensor), cycles, level,
-            whole, gradient, own, scratch,
-        )  # fmt: skip
-        out[k] = eliminated(whole[None], p)[0]
-    return out
+        nothing, glass = np.zeros((zones, bins)), n * glass_counts(sensor)
+        whole[k] = sums_of_frame(nothing, n * here[k], n * slopes[k], 1.0, ambient, glass, cycles).information
+    return eliminated(whole, len(free))

@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.histograms.poisson_fit import ambient_step, frame_sums
+from phasemark.matcher.estimate.solver import descend
+from phasemark.matcher.histograms.poisson_fit import ambient_step, sums_of_frame
 from phasemark.matcher.histograms.scene_prediction import shifted
 from phasemark.matcher.histograms.table_search import BRIGHTEST, DIMMEST
 from phasemark.render.view import VIEW_FIELDS
 
-SceneAt = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Returns signal and slopes of one frame at a state."""
 _INNER_STEPS = 12
-_INNER_HALVINGS = 4
+_INNER_SHARES = (1.0, 0.3, 0.09, 0.027)
 _INNER_DONE = 1e-2  # squared standard deviations
 _NEAR_ENOUGH = 0.7
 """A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it."""
@@ -29,7 +28,9 @@ _WORSE = 0.5
 _SAME = np.array([0.005, *[math.radians(1.0)] * 2, 0.005, *[math.radians(1.0)] * 2])
 """A fit this near to another one, on its way, ends where that one did."""
 _NO_INFORMATION = 1e-300
-_LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
+LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
+"""Longest step of a view between two scenes, by unit."""
+_LONGEST_LOG_BRIGHT = 0.5
 
 
 class Counted(NamedTuple):
@@ -54,65 +55,72 @@ class Counted(NamedTuple):
     drift_bins: NDArray[np.float64]
 
 
-class Search(NamedTuple):
-    """Parameters that a fit varies, and how far.
-
-    A state is the six numbers of a view, and after them what the frame leaves open besides: nuisances, the slopes of
-    which come after those of the view.
+class Start(NamedTuple):
+    """Initial guess of a fit.
 
     Parameters
     ----------
-    free : tuple of str
-        Parameters of the view.
-    columns : (q,) int64
-        Which numbers of a state are varied: those of `free`, then the nuisances.
-    weight : (q,) float64
-        Information before the frame is seen, of Gaussian priors of mean 0.
-    limits : (2, states) float64
-        Least and greatest values of a state.
-    longest : (q,) float64
-        Longest step between two scenes.
-    most : int
-        Scenes with slopes that are rendered at most.
+    class_index : int
+    state : (6 + k,) float64
+    cost : float
+        Deviance by the table.
+    bright : float
+    ambient : (zones,) float64
     """
 
-    free: tuple[str, ...]
-    columns: NDArray[np.int64]
-    weight: NDArray[np.float64]
-    limits: NDArray[np.float64]
-    longest: NDArray[np.float64]
-    most: int
+    class_index: int
+    state: NDArray[np.float64]
+    cost: float
+    bright: float
+    ambient: NDArray[np.float64]
+
+    @property
+    def view(self) -> NDArray[np.float64]:
+        """The six numbers of the view."""
+        return self.state[: len(VIEW_FIELDS)]
 
 
-def search_of(
-    free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64], most: int,
-    nuisances: NDArray[np.float64] | None = None,
-) -> Search:  # fmt: skip
-    """Return what a fit varies.
+class Model(Protocol):
+    """Expected signal counts of one frame, from exact scenes or from a table."""
+
+    nuisances: NDArray[np.float64]
+
+    def scene(self, state: NDArray[np.float64], free: Sequence[str]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the counts at a state, (zones, bins), and their slopes by free parameters and nuisances."""
+
+
+class Search:
+    """Parameters that a fit varies, and how far.
+
+    A state is the six numbers of a view, and after them the nuisances of a model.
 
     Parameters
     ----------
+    model : Model
     free : sequence of str
         Parameters of the view.
     prior_std : (p,) float64
-        Of each; infinite where nothing is known.
+        Of each, about 0; infinite where nothing is known.
     limits : (2, 6) float64
-    most : int
-    nuisances : (3, k) float64, optional
-        Least and greatest value and longest step of each nuisance.
+        Least and greatest values of a view.
     """
-    more = np.empty((3, 0)) if nuisances is None else nuisances
-    names = tuple(free)
-    longest = [_LONGEST[name.rpartition("_")[2]] for name in names]
-    columns = [*map(VIEW_FIELDS.index, names), *(len(VIEW_FIELDS) + k for k in range(more.shape[1]))]
-    return Search(
-        names,
-        np.array(columns, dtype=np.int64),
-        np.concatenate([1 / prior_std**2, np.zeros(more.shape[1])]),
-        np.concatenate([limits, more[:2]], axis=1),
-        np.concatenate([longest, more[2]]),
-        most,
-    )
+
+    def __init__(
+        self, model: Model, free: Sequence[str], prior_std: NDArray[np.float64], limits: NDArray[np.float64]
+    ) -> None:
+        low, high, longest = model.nuisances
+        self.model, self.free = model, tuple(free)
+        columns = [*map(VIEW_FIELDS.index, free), *range(len(VIEW_FIELDS), len(VIEW_FIELDS) + len(low))]
+        self.columns = np.array(columns, dtype=np.int64)
+        self.weight = np.concatenate([1 / prior_std**2, np.zeros(len(low))])
+        self.limits = np.concatenate([limits, [low, high]], axis=1)
+        self.longest = np.concatenate([[LONGEST[name.rpartition("_")[2]] for name in free], longest])
+
+    def moved(self, state: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return a state after a step of what is varied, within the limits."""
+        state = state.copy()
+        state[self.columns] += step
+        return np.asarray(np.clip(state, *self.limits))
 
 
 class Fit(NamedTuple):
@@ -147,21 +155,18 @@ class Fit(NamedTuple):
 
 
 def fit_view(
-    scene_at: SceneAt, frame: Counted, state: NDArray[np.float64], bright: float, ambient: NDArray[np.float64],
-    search: Search, hopeless: float, known: Sequence[NDArray[np.float64]] = (),
+    search: Search, frame: Counted, start: Start, most: int, hopeless: float = math.inf,
+    known: Sequence[NDArray[np.float64]] = (),
 ) -> Fit | None:  # fmt: skip
     """Refine a view until a scene rendered there explains the frame best.
 
     Parameters
     ----------
-    scene_at : callable
-        Returns the expected signal counts of one frame at a state, (zones, bins), and their slopes, (q, zones, bins).
-    frame : Counted
-    state : (6 + k,) float64
-        Where to start.
-    bright : float
-    ambient : (zones,) float64
     search : Search
+    frame : Counted
+    start : Start
+    most : int
+        Scenes with slopes that are rendered at most.
     hopeless : float
         A fit that will cost more than this is given up.
     known : sequence of (6,) float64
@@ -172,148 +177,91 @@ def fit_view(
     Fit or None
         None of a fit that was given up.
     """
-    columns, n_view = search.columns, len(VIEW_FIELDS)
     best: Fit | None = None
-    step, shrink = np.zeros(len(columns)), 1.0
-    state = np.clip(state, *search.limits)
-    for _ in range(search.most):
-        scene = _scene(scene_at(state), frame, search, state[columns])
-        here = scene.at_view(bright, ambient)
+    n_free, shrink = len(search.free), 1.0
+    step = np.zeros(len(search.columns))
+    state, bright, ambient = np.clip(start.state, *search.limits), start.bright, start.ambient
+    for _ in range(most):
+        here = _linear_scene(search, frame, state, bright, ambient)
         if best is not None and here.cost > best.cost + _WORSE:
             shrink *= _SHRINK
             if shrink < _LEAST_SHRINK:
                 break
-            state = best.state.copy()
-            state[columns] += shrink * step
-            state = np.clip(state, *search.limits)
+            state = search.moved(best.state, shrink * step)
             continue
-        offset, there = scene.descend(here, search.longest)
-        best = Fit(state.copy(), here.bright, here.ambient, here.deviance, here.cost, here.level, there.information)
-        bright, ambient, shrink, step = there.bright, there.ambient, 1.0, offset
-        state = state.copy()
-        state[columns] += offset
-        state = np.clip(state, *search.limits)
-        turn, others = np.split(offset, [len(search.free)])
-        settled = (np.abs(others) <= _SETTLED * search.longest[len(search.free) :]).all()
-        if settled and float(turn @ there.information @ turn) < _NEAR_ENOUGH**2:
-            return Fit(state, bright, ambient, there.deviance, there.cost, there.level, there.information)
-        if there.cost > hopeless or any((np.abs(state[:n_view] - other) < _SAME).all() for other in known):
+        longest = np.append(search.longest, _LONGEST_LOG_BRIGHT)
+        there, left, _ = descend(
+            here, longest, most=_INNER_STEPS, done=_INNER_DONE, shares=_INNER_SHARES, excess=_LinearScene.excess
+        )
+        step, shrink = there.offset + left[:-1], 1.0  # what is left changes neither the counts nor their slopes
+        best = here.fit(state, there.view_information)
+        state, bright, ambient = search.moved(state, step), there.bright, there.ambient
+        settled = (np.abs(step[n_free:]) <= _SETTLED * search.longest[n_free:]).all()
+        if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < _NEAR_ENOUGH**2:
+            return there.fit(state, there.view_information)
+        near = (np.abs(state[: len(VIEW_FIELDS)] - other) < _SAME for other in known)
+        if there.cost > hopeless or any(one.all() for one in near):
             return None
     return best
 
 
-def _scene(
-    found: tuple[NDArray[np.float64], NDArray[np.float64]], frame: Counted, search: Search, theta: NDArray[np.float64]
-) -> Scene:
-    """Return the scene of a frame from the signal of one frame and its slopes."""
-    whole = np.concatenate([found[0][None], found[1]])
-    n_zones, bins = whole.shape[1:]
-    n_positions = len(frame.drift_bins)
-    apart = whole.reshape(-1, n_zones // n_positions, bins)
+def _linear_scene(
+    search: Search, frame: Counted, state: NDArray[np.float64], bright: float, ambient: NDArray[np.float64]
+) -> _LinearScene:
+    """Return the scene of a frame at a state."""
+    signal, slopes = search.model.scene(state, search.free)
+    whole = np.concatenate([signal[None], slopes])
+    apart = whole.reshape(-1, whole.shape[1] // len(frame.drift_bins), whole.shape[2])
     whole = frame.n_frames * shifted(apart, np.tile(frame.drift_bins, len(whole))).reshape(whole.shape)
-    return Scene(frame, whole[0], whole[1:], search.weight, theta, len(search.free))
+    offset = np.zeros(len(search.columns))
+    return _LinearScene(search, frame, whole, state[search.columns], offset, bright, ambient)
 
 
-class Point(NamedTuple):
-    """The linear scene somewhere."""
+class _LinearScene:
+    """A scene whose signal is linear in what a search varies, at an offset from the state where it was rendered.
 
-    bright: float
-    ambient: NDArray[np.float64]
-    deviance: float
-    cost: float
-    level: NDArray[np.float64]
-    information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    own: NDArray[np.float64]
-
-
-class Scene:
-    """A scene about a view, its signal linear in the free parameters.
-
-    Parameters
-    ----------
-    frame : Counted
-    signal : (zones, bins) float64
-    slope : (p, zones, bins) float64
-    weight : (p,) float64
-        Information in the free parameters before the frame is seen.
-    theta : (p,) float64
-        Free parameters about which the scene is linear.
-    n_view : int
-        How many of them are of the view; the others are nuisances.
+    The last parameter is the logarithm of the brightness; ambient light is at its best after every step.
     """
 
     def __init__(
-        self, frame: Counted, signal: NDArray[np.float64], slope: NDArray[np.float64], weight: NDArray[np.float64],
-        theta: NDArray[np.float64], n_view: int,
+        self, search: Search, frame: Counted, whole: NDArray[np.float64], theta: NDArray[np.float64],
+        offset: NDArray[np.float64], bright: float, ambient: NDArray[np.float64],
     ) -> None:  # fmt: skip
-        self._frame, self._signal, self._weight, self._theta = frame, signal, weight, theta
-        self._slope, self._n_view = np.ascontiguousarray(slope), n_view
+        self._search, self._frame, self._whole, self._theta = search, frame, whole, theta
+        self.offset, self.ambient, self.bright = offset, ambient, min(max(bright, DIMMEST), BRIGHTEST)
+        signal = whole[0]
+        if offset.any():
+            signal = np.maximum(signal + np.tensordot(offset, whole[1:], axes=1), 0.0)
+        self._sums = sums_of_frame(frame.counts, signal, whole[1:], self.bright, ambient, frame.extra, frame.cycles)
+        at, weight = theta + offset, search.weight
+        self.cost = self._sums.deviance + float(weight @ at**2)
+        self.information, self.gradient = self._sums.information, self._sums.gradient
+        self.gradient[:-1] -= weight * at
+        self.information[np.diag_indices(len(at))] += weight
 
-    def at_view(self, bright: float, ambient: NDArray[np.float64]) -> Point:
-        """Return what is known at the view itself."""
-        offset = np.zeros(len(self._theta))
-        return self._with_prior(self._at(offset, bright, ambient), offset)
+    def moved(self, step: NDArray[np.float64]) -> _LinearScene:
+        """Return the scene a step away."""
+        ambient = self.ambient.copy()
+        ambient_step(self._sums.own, step, ambient)
+        bright = self.bright * math.exp(float(step[-1]))
+        return _LinearScene(
+            self._search, self._frame, self._whole, self._theta, self.offset + step[:-1], bright, ambient
+        )
 
-    def descend(self, point: Point, longest: NDArray[np.float64]) -> tuple[NDArray[np.float64], Point]:
-        """Return how far away the linear scene explains the frame best, within the longest steps, and what is there."""
-        p = len(self._theta)
-        offset = np.zeros(p)
-        for _ in range(_INNER_STEPS):
-            scale = np.sqrt(np.maximum(np.diag(point.information), 1e-300))
-            normal = point.information / np.outer(scale, scale) + 1e-9 * np.eye(p + 1)
-            step = np.linalg.solve(normal, point.gradient / scale) / scale
-            gain = float(step @ point.gradient)
-            if gain < _INNER_DONE:  # what is left changes neither the counts nor their slopes
-                offset = offset + step[:p]
-                break
-            farthest = float((np.abs(offset + step[:p]) / longest).max(initial=0.0))
-            step = step / max(1.0, farthest, 2 * abs(float(step[p])))
-            better = None
-            for _ in range(_INNER_HALVINGS):
-                trial = self._moved(point, step, offset + step[:p])
-                if trial.cost <= point.cost:
-                    better = trial
-                    break
-                step = step * _SHRINK
-            if better is None:
-                break
-            offset, point = offset + step[:p], better
-        return offset, point._replace(information=self._view_information(point))
+    def excess(self, step: NDArray[np.float64]) -> float:
+        """Return by which factor a step leads too far away from where the scene was rendered."""
+        farthest = float((np.abs(self.offset + step[:-1]) / self._search.longest).max(initial=0.0))
+        return max(farthest, abs(float(step[-1])) / _LONGEST_LOG_BRIGHT)
 
-    def _view_information(self, point: Point) -> NDArray[np.float64]:
-        """Return the information in the view alone, brightness and nuisances eliminated."""
-        whole = point.information
-        while len(whole) > self._n_view:
+    @property
+    def view_information(self) -> NDArray[np.float64]:
+        """Information in the view alone, brightness and nuisances eliminated."""
+        whole = self.information
+        while len(whole) > len(self._search.free):
             own = max(float(whole[-1, -1]), _NO_INFORMATION)
             whole = whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]) / own
-        return np.asarray(whole)
+        return whole
 
-    def _at(self, offset: NDArray[np.float64], bright: float, ambient: NDArray[np.float64]) -> Point:
-        signal = self._signal
-        if offset.any():
-            signal = np.maximum(signal + np.tensordot(offset, self._slope, axes=1), 0.0)
-        p, shape = len(offset), signal.shape
-        level, information, gradient = np.empty(shape), np.empty((p + 1, p + 1)), np.empty(p + 1)
-        own, scratch = np.empty((shape[0], p + 3)), np.empty((2, p + 2))
-        bright = min(max(bright, DIMMEST), BRIGHTEST)
-        deviance = frame_sums(
-            self._frame.counts, signal, self._slope, bright, ambient, self._frame.extra, self._frame.cycles, level,
-            information, gradient, own, scratch,
-        )  # fmt: skip
-        return Point(bright, ambient, deviance, deviance, level, information, gradient, own)
-
-    def _moved(self, point: Point, step: NDArray[np.float64], offset: NDArray[np.float64]) -> Point:
-        ambient = point.ambient.copy()
-        ambient_step(point.own, step, ambient)
-        return self._with_prior(self._at(offset, point.bright * math.exp(float(step[-1])), ambient), offset)
-
-    def _with_prior(self, point: Point, offset: NDArray[np.float64]) -> Point:
-        if not self._weight.any():
-            return point
-        theta = self._theta + offset
-        cost = point.deviance + float(self._weight @ theta**2)
-        gradient, information = point.gradient.copy(), point.information.copy()
-        gradient[:-1] -= self._weight * theta
-        information[np.arange(len(theta)), np.arange(len(theta))] += self._weight
-        return point._replace(cost=cost, gradient=gradient, information=information)
+    def fit(self, state: NDArray[np.float64], information: NDArray[np.float64]) -> Fit:
+        """Return the scene as a fit."""
+        return Fit(state, self.bright, self.ambient, self._sums.deviance, self.cost, self._sums.level, information)

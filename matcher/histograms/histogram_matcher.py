@@ -5,98 +5,71 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
-from phasemark import UsageError
-from phasemark.data import Bank
-from phasemark.matcher.estimate.acceptance import Rules, no_answer
-from phasemark.matcher.histograms.alone_search import AloneSearch
-from phasemark.matcher.histograms.exact_fit import Counted, Fit, fit_view, search_of
-from phasemark.matcher.histograms.histogram_table import TableGrid, plan_table
-from phasemark.matcher.histograms.joint_match import match_together
-from phasemark.matcher.histograms.plane_search import PlaneSearch
-from phasemark.matcher.histograms.poisson_fit import deviance_test, doubtful_deviance, moments_of
-from phasemark.matcher.histograms.scene_models import planes_of, scene_at
-from phasemark.matcher.histograms.search_plan import LandmarkSearch, SearchPlan, Start
-from phasemark.matcher.histograms.table_search import ambient_light
+from phasemark.matcher.estimate.acceptance import no_answer
+from phasemark.matcher.histograms.direct_matcher import glass_counts
+from phasemark.matcher.histograms.exact_fit import Counted, Fit, Search, Start, fit_view
+from phasemark.matcher.histograms.histogram_search import SCENES, SURE_COST, HistogramSearch
+from phasemark.matcher.histograms.poisson_fit import deviance_of, deviance_test, doubtful_deviance, moments_of
+from phasemark.matcher.histograms.scene_models import JointModel, view_from
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
-from phasemark.render import Background, Sensor
-from phasemark.render.direct.bin_counts import response_share
-from phasemark.render.direct.fit_model import undo_pile_up
+from phasemark.render import Background
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
-from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
 
-_SURE_COST = 40.0
-"""A hill of the table this much worse than the best one cannot be the answer, nor make it ambiguous …"""
 _TABLE_ERROR = 4.0
-"""… beside this multiple of how far the deviance of the table was off for the best one."""
+"""How far the table may be wrong about another hill, over how far it was off for the best one."""
 _MOST_FITS = 8
-_SCENES = 8
-_WIDEST_BEARING_RAD = math.radians(4.0)
-_BEARING_SIGMA = 2.0
-"""A free bearing has two further tables, as far aside as these say."""
-_STEEPEST_RAD = math.radians(20.0)
+_OF_CLASS = 4
+"""Starts of each class that a joint fit follows to the end."""
+_SAME_M, _SAME_RAD = 0.02, math.radians(5.0)
+_OWN = VIEW_FIELDS[:3]
+_NEAR = np.array([0.05, *[math.radians(15.0)] * 2, 0.0, 0.0, 0.0])
+"""What a frame by itself may have otherwise than all frames together, and how far."""
+_TESTS = 3
+
+Found = list[tuple[int, Fit]]
+"""Classes and fits."""
 
 
-class HistogramMatcher:
-    """Estimates class and view from histograms of a direct sensor.
+class HistogramMatcher(HistogramSearch):
+    """Estimates class and view from histograms; see :class:`~.direct_matcher.DirectMatcher`.
 
-    Parameters
-    ----------
-    bank : Bank
-        Its meshes and the span of its grid are used. Its images are not: histograms are rendered when the first frames
-        come, which takes some seconds and :attr:`table_bytes` of memory.
-    prior_std : sequence of float
-        Standard deviation of each free parameter before a frame is seen, about 0; infinite where nothing is known.
-    rules : Rules
-        When an answer is accepted.
-    background : Background, "auto" or None
-        What stands behind the landmark; the brightness of its planes is estimated. "auto": a wall whose distance is
-        estimated too.
-    workers : int
-        Threads; the answers do not depend on their number.
+    The brightness of the landmark and of each plane behind it is estimated too.
     """
-
-    def __init__(
-        self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
-        background: Background | Literal["auto"] | None = None, workers: int = 1,
-    ) -> None:  # fmt: skip
-        self.sensor = bank.camera
-        check_histogram_sensor(bank)
-        self.rules, self._workers, free = rules, workers, rules.free
-        prior = np.array(prior_std, dtype=np.float64)
-        meshes = [bank.mesh(name) for name in bank.classes]
-        self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
-        self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
-        bearings: tuple[float, ...] = (0.0,)
-        if "bearing_rad" in free:
-            side = min(_BEARING_SIGMA * float(prior[free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
-            bearings = (0.0, -side, side)
-        plan = SearchPlan(self.signals, self.grid, free, prior, view_limits(self.grid), bearings, workers)
-        self._plan = plan
-        self.search: LandmarkSearch = AloneSearch(plan)
-        if isinstance(background, str) or (background is not None and planes_of(background)):
-            self.search = PlaneSearch(plan, background)
-
-    @property
-    def table_bytes(self) -> int:
-        """How large the tables of histograms are in memory."""
-        return self.search.table_bytes
 
     def match(self, frames: HistogramFrames) -> list[Match]:
         """Return an answer for every position of the bank's sensor, whose frames are added up."""
-        counted = counted_frames(frames)
-        self.search.prepare()
-        if self._workers == 1 or len(counted) < 2:
-            return [self._match(one) for one in counted]
-        with ThreadPoolExecutor(self._workers) as pool:
-            return list(pool.map(self._match, counted))
+        self.prepare()
+        return self._on_threads(self._match, _counted(frames))
+
+    def _match(self, frame: Counted) -> Match:
+        starts, bare = self.looked(frame)
+        if not starts:
+            return no_answer(self.rules)
+        least = starts[0].cost
+        fits: Found = []
+        offset, margin, n_tried = 0.0, SURE_COST, 0
+        for start in starts[:_MOST_FITS]:
+            if fits and start.cost > least + margin:
+                break
+            n_tried += 1
+            if not _follow(fits, self.searches[start.class_index], frame, start):
+                continue
+            if len(fits) == 1:
+                offset = fits[0][1].cost - least  # of the exact deviance over that of the table
+                margin += _TABLE_ERROR * abs(offset)
+        others = [Explanation(one.class_index, one.view, one.cost + offset, None) for one in starts[n_tried:]]
+        best_class, best = _best(fits)
+        estimated = _estimated(self.searches[best_class], frame)
+        test = FitTest(*deviance_test(best.deviance, *moments_of(best.level), estimated))
+        return self._answer(fits, others, test, bare, estimated, self.background_of(best.state))
 
     def match_jointly(self, frames: HistogramFrames, first2camera: NDArray[np.float64]) -> Match:
         """Return one answer for a landmark that several positions see, the view as the first one has it.
@@ -107,102 +80,134 @@ class HistogramMatcher:
         first2camera : (n, 4, 4) float64
             From the frame of the first position's camera to that of each.
         """
-        counted = counted_frames(frames)
-        self.search.prepare()
-        with ThreadPoolExecutor(self._workers) as pool:
-            looked = list(pool.map(self._looked, counted))
-        starts, bare = zip(*looked, strict=True)
-        return match_together(self.search, self._plan, self.rules, counted, starts, sum(bare), first2camera)
-
-    def _looked(self, frame: Counted) -> tuple[list[Start], float]:
-        """Return where fits of a frame begin, and what it costs without a landmark."""
-        counts = shifted_back(
-            undo_pile_up(frame.counts, frame.cycles) if math.isfinite(frame.cycles) else frame.counts,
-            float(frame.drift_bins[0]),
-        )
-        ambient = ambient_light(counts, frame.extra)
-        starts = self.search.starts(frame, counts, ambient)
-        return starts, self.search.bare_cost(frame, ambient) if starts else 0.0
-
-    def _match(self, frame: Counted) -> Match:
-        starts, bare = self._looked(frame)
-        if not starts:
+        counted = _counted(frames)
+        self.prepare()
+        with ThreadPoolExecutor(self.workers) as pool:
+            found, bare = zip(*pool.map(self.looked, counted), strict=True)
+        begin = self._joint_starts(found, first2camera)
+        if not begin:
             return no_answer(self.rules)
-        least = starts[0].cost
-        fits: list[tuple[int, Fit]] = []
-        offset, margin, n_tried = 0.0, _SURE_COST, 0
-        for start in starts[:_MOST_FITS]:
-            if fits and start.cost > least + margin:
-                break
-            n_tried += 1
-            hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _SURE_COST
-            known = [fit.view for other, fit in fits if other == start.class_index]
-            model, plan = self.search.model(start.class_index), self._plan
-            search = search_of(plan.free, plan.prior_std, plan.limits, _SCENES, model.nuisances)
-            fit = fit_view(
-                scene_at(model, plan.free), frame, start.state, start.bright, start.ambient, search, hopeless, known
-            )
-            if fit is None:
-                continue
-            if not fits:
-                offset = fit.cost - least  # of the exact deviance over that of the table
-                margin += _TABLE_ERROR * abs(offset)
-            fits.append((start.class_index, fit))
-        found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in fits]
-        found += [
-            Explanation(s.class_index, s.state[: len(VIEW_FIELDS)], s.cost + offset, None) for s in starts[n_tried:]
-        ]
-        best_class, best = min(fits, key=lambda pair: pair[1].cost)
-        mean, variance = moments_of(best.level)
-        free = len(self.rules.free) + self.search.model(best_class).nuisances.shape[1] + 1 + len(best.ambient)
-        test = FitTest(*deviance_test(best.deviance, mean, variance, free))
-        doubt = best.cost - best.deviance + doubtful_deviance(mean, variance, free, self.rules.false_alarm)
-        behind = self.search.background_of(best)
-        return answer_from(self.rules, found, test, bare, doubt, behind)
-
-
-def check_histogram_sensor(bank: Bank) -> None:
-    """Refuse a bank whose sensor counts no histograms.
-
-    Raises
-    ------
-    UsageError
-    """
-    if bank.camera.kind != "direct" or bank.camera.histogram is None:
-        lacks = "without a [histogram] table" if bank.camera.kind == "direct" else "a phase camera"
-        raise UsageError(
-            f"histograms and targets take a bank of a direct sensor with a [histogram] table: '{bank.plan.sensor}' is"
-            f" {'one ' if bank.camera.kind == 'direct' else ''}{lacks}"
+        joint = counted[0]._replace(
+            counts=np.concatenate([frame.counts for frame in counted]),
+            drift_bins=np.concatenate([frame.drift_bins for frame in counted]),
         )
+        models = [JointModel(model, first2camera) for model in self.models]
+        searches = [Search(model, self.free, self.prior_std, self.limits) for model in models]
+        first = []
+        for start in begin:
+            fit = fit_view(searches[start.class_index], joint, start, 1)
+            if fit is not None:
+                first.append(start._replace(state=fit.state, bright=fit.bright, ambient=fit.ambient, cost=fit.cost))
+        first.sort(key=lambda start: start.cost)
+        fits: Found = []
+        for c, search in enumerate(searches):
+            for start in [start for start in first if start.class_index == c][:_OF_CLASS]:
+                _follow(fits, search, joint, start)
+        best_class, best = _best(fits)
+        estimated = _estimated(searches[best_class], joint)
+        apart = self._best_apart(counted, models[best_class], first2camera, best)
+        test = _joint_test(best, joint, estimated, apart, len(_OWN) * len(counted) - len(self.free))
+        return self._answer(fits, (), test, sum(bare), estimated, None)
+
+    def _answer(
+        self, fits: Found, others: Sequence[Explanation], test: FitTest, bare: float, estimated: int,
+        background: Background | None,
+    ) -> Match:  # fmt: skip
+        """Return the answer that fits give; `others` were not followed to the end."""
+        found = [Explanation(c, fit.view, fit.cost, fit.information) for c, fit in fits]
+        _, best = _best(fits)
+        refused = doubtful_deviance(*moments_of(best.level), estimated, self.rules.false_alarm)
+        return answer_from(self.rules, [*found, *others], test, bare, best.cost - best.deviance + refused, background)
+
+    def _joint_starts(self, starts: Sequence[Sequence[Start]], first2camera: NDArray[np.float64]) -> list[Start]:
+        """Return where joint fits begin: the hills of every frame, those that are the same taken once.
+
+        Brightness, ambient light and nuisances of every frame are those of its own best hill of the class, or of any.
+        """
+        if not all(starts):
+            return []
+        fixed = np.array([name not in self.free for name in VIEW_FIELDS])
+        out: list[Start] = []
+        for c in range(len(self.searches)):
+            own = [min(of_frame, key=lambda start: (start.class_index != c, start.cost)) for of_frame in starts]
+            extra = [np.array([best.bright / own[0].bright, *best.state[len(VIEW_FIELDS) :]]) for best in own]
+            ambient = np.concatenate([best.ambient for best in own])
+            views: list[NDArray[np.float64]] = []
+            for there, of_frame in zip(first2camera, starts, strict=True):
+                for start in of_frame:
+                    if start.class_index != c:
+                        continue
+                    view = np.where(fixed, 0.0, view_from(np.linalg.inv(there), start.view))
+                    view = np.clip(view, *self.limits)
+                    if any(_is_same(view, other) for other in views):
+                        continue
+                    views.append(view)
+                    state = np.concatenate([view, *extra])
+                    out.append(Start(c, np.delete(state, len(VIEW_FIELDS)), start.cost, own[0].bright, ambient))
+        return out
+
+    def _best_apart(
+        self, frames: Sequence[Counted], model: JointModel, first2camera: NDArray[np.float64], best: Fit
+    ) -> list[float]:
+        """Return the deviance of each frame where it has a view and a class of its own."""
+        out = []
+        ambient = np.split(best.ambient, len(frames))
+        rows = model.split(best.state[len(VIEW_FIELDS) :])
+        for frame, there, light, (ratio, *own) in zip(frames, first2camera, ambient, rows, strict=True):
+            view = view_from(there, best.view)
+            limits = np.stack([view - _NEAR, view + _NEAR])
+            start = Start(0, np.array([*view, *own]), 0.0, best.bright * ratio, light)
+            searches = [Search(one, _OWN, np.full(len(_OWN), math.inf), limits) for one in self.models]
+            fits = [fit_view(search, frame, start, SCENES) for search in searches]
+            out.append(min((fit.deviance for fit in fits if fit is not None), default=math.inf))
+        return out
 
 
-def refuse_other_sensor(own: Sensor, other: Sensor) -> None:
-    """Refuse frames that were taken with another sensor.
+def _follow(fits: Found, search: Search, frame: Counted, start: Start) -> bool:
+    """Fit a view from a start and add it to the others; returns False where the fit was given up."""
+    hopeless = min((fit.cost for _, fit in fits), default=math.inf) + SURE_COST
+    known = [fit.view for other, fit in fits if other == start.class_index]
+    fit = fit_view(search, frame, start, SCENES, hopeless, known)
+    if fit is not None:
+        fits.append((start.class_index, fit))
+    return fit is not None
 
-    Raises
-    ------
-    UsageError
+
+def _best(fits: Found) -> tuple[int, Fit]:
+    """Return the fit of the least cost, and its class."""
+    return min(fits, key=lambda pair: pair[1].cost)
+
+
+def _estimated(search: Search, frame: Counted) -> int:
+    """Return how many numbers a fit estimates: with those of the search, brightness and the ambient light of zones."""
+    return len(search.columns) + 1 + len(frame.counts)
+
+
+def _is_same(view: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    apart = np.abs(view - other)
+    turn = abs(math.remainder(float(view[1] - other[1]), 2 * math.pi))
+    return bool(max(apart[0], apart[3]) < _SAME_M and max(turn, *apart[[2, 4, 5]]) < _SAME_RAD)
+
+
+def _joint_test(best: Fit, joint: Counted, estimated: int, apart: Sequence[float], more: int) -> FitTest:
+    """Return the test of a joint fit.
+
+    It is the least favourable of three: of all frames together, of each frame, and of what the frames gain by a view
+    and a class of their own, χ² with `more` degrees of freedom. The last one finds frames that contradict each other
+    where a landmark between them explains all frames nearly as well.
     """
-    difference = other.optics_difference(own)
-    if difference is None and other.histogram != own.histogram:
-        ours, theirs = histogram_of(own).model_dump(), histogram_of(other).model_dump()
-        name = next(name for name in ours if ours[name] != theirs[name])
-        difference = f"'histogram.{name}' is {theirs[name]} here and {ours[name]} there"
-    if difference is not None:
-        raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+    n = len(apart)
+    chi2, dof, whole = deviance_test(best.deviance, *moments_of(best.level), estimated)
+    each, gain = 1.0, 0.0
+    for counts, level, least in zip(np.split(joint.counts, n), np.split(best.level, n), apart, strict=True):
+        deviance = deviance_of(counts, level)
+        each = min(each, deviance_test(deviance, *moments_of(level), round(estimated / n))[2])
+        gain += max(deviance - least, 0.0)
+    agree = float(special.chdtrc(more, gain)) if more > 0 else 1.0
+    return FitTest(chi2, dof, min(1.0, _TESTS * min(whole, n * each, agree)))
 
 
-def view_limits(grid: TableGrid) -> NDArray[np.float64]:
-    """Return least and greatest values of a view that is looked for, (2, 6)."""
-    low, high = np.full(len(VIEW_FIELDS), -math.inf), np.full(len(VIEW_FIELDS), math.inf)
-    low[0], high[0] = grid.distance_m[0], grid.distance_m[-1]
-    if not grid.cyclic:
-        low[1], high[1] = grid.delta_rad[0], grid.delta_rad[-1]
-    low[4:], high[4:] = -_STEEPEST_RAD, _STEEPEST_RAD
-    return np.stack([low, high])
-
-
-def counted_frames(frames: HistogramFrames) -> list[Counted]:
+def _counted(frames: HistogramFrames) -> list[Counted]:
     """Return what was counted at each position, its frames added up."""
     histogram = histogram_of(frames.sensor)
     n_frames = float(frames.counts.shape[1])
@@ -212,18 +217,3 @@ def counted_frames(frames: HistogramFrames) -> list[Counted]:
         Counted(np.ascontiguousarray(counts), n_frames, cycles, extra, np.array([drift]))
         for counts, drift in zip(frames.zone_counts, frames.drift_bins, strict=True)
     ]
-
-
-def glass_counts(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the expected counts of the cover glass in one frame, (bins,)."""
-    histogram = histogram_of(sensor)
-    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
-    return np.asarray(histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram)))
-
-
-def shifted_back(counts: NDArray[np.float64], bins: float) -> NDArray[np.float64]:
-    """Return histograms shifted to earlier bins, linear between bins; (zones, bins)."""
-    if bins == 0:
-        return counts
-    at = np.arange(counts.shape[1]) + bins
-    return np.stack([np.interp(at, np.arange(counts.shape[1]), row) for row in counts])

@@ -1,18 +1,21 @@
 """A table of a bank's histograms on a grid of distance and δ, and signals in between by cubic interpolation.
 
-It serves the search and the slopes on the way; the answer itself is taken from scenes rendered where it lies.
+It serves the search and the slopes on the way; the answer itself is taken from scenes rendered where it lies. A zone's
+light from a plane is taken as that of the plane with nothing before it, times the share that the landmark leaves
+visible. That is exact where a zone sees the plane within a bin or two, and good enough for a search elsewhere.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render import Sensor, Views
+from phasemark.matcher.histograms.scene_models import planes_of
+from phasemark.render import Background, Sensor, Views
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.kernel import kernel
@@ -26,6 +29,8 @@ _NEAREST_TO_SURFACE_M = 0.02
 _DARK = 1e-5  # of the brightest zone's light: less does not light a zone
 _FEWEST_NODES = 4  # of a cubic
 _SAME_RAD = 1e-6
+_COARSE_M = 1.0
+"""Shares of planes need no ranges: cells of a floor are not cut."""
 
 
 class Table(NamedTuple):
@@ -46,6 +51,8 @@ class Table(NamedTuple):
         First distance and its step, first δ and its step.
     cyclic : bool
         Whether the last δ is followed by the first one.
+    visible : (classes, distances, angles, planes, zones) float32
+        Share of each plane's light that the landmark leaves.
     """
 
     signal: NDArray[np.float32]
@@ -55,11 +62,12 @@ class Table(NamedTuple):
     basis: NDArray[np.float64]
     grid: NDArray[np.float64]
     cyclic: bool
+    visible: NDArray[np.float32]
 
     @property
     def n_bytes(self) -> int:
         """Size in memory."""
-        return self.signal.nbytes + self.moments.nbytes
+        return self.signal.nbytes + self.moments.nbytes + self.visible.nbytes
 
 
 class TableGrid(NamedTuple):
@@ -79,10 +87,10 @@ class TableGrid(NamedTuple):
     first_bin: NDArray[np.int64]
     window: int
 
-    def n_bytes(self, sensor: Sensor, n_classes: int) -> int:
+    def n_bytes(self, sensor: Sensor, n_classes: int, n_planes: int) -> int:
         """Return how large the table gets in memory."""
         views = n_classes * len(self.distance_m) * len(self.delta_rad)
-        return 4 * views * sensor.rows * sensor.cols * (self.window + STATISTICS)
+        return 4 * views * sensor.rows * sensor.cols * (self.window + STATISTICS + n_planes)
 
 
 def response_width_m(sensor: Sensor) -> float:
@@ -130,9 +138,8 @@ def plan_table(
 
 
 def build_table(
-    signals: Sequence[ViewSignals], grid: TableGrid, bearing_rad: float = 0.0, workers: int = 1,
-    counts_of: Callable[[int, int, Views], NDArray[np.float64]] | None = None,
-) -> Table:  # fmt: skip
+    signals: Sequence[ViewSignals], grid: TableGrid, background: Background | None, bearing_rad: float, workers: int
+) -> Table:
     """Render a table.
 
     Parameters
@@ -140,26 +147,29 @@ def build_table(
     signals : sequence of ViewSignals
         Of each class, by one sensor.
     grid : TableGrid
+    background : Background, optional
+        What stands behind the landmark.
     bearing_rad : float
         Of all views.
     workers : int
         Threads; the result does not depend on their number.
-    counts_of : callable, optional
-        Returns the counts of the landmark at views of a class and a distance, (n, zones, bins); None: it stands alone.
     """
-    sensor, window = signals[0].sensor, grid.window
+    sensor, window, planes = signals[0].sensor, grid.window, list(planes_of(background))
     n_zones, bins = sensor.rows * sensor.cols, histogram_of(sensor).bins
-    shape = (len(signals), len(grid.distance_m), len(grid.delta_rad), n_zones, window)
-    signal = np.zeros(shape, np.float32)
-    views = Views.broadcast(grid.distance_m[:, None], grid.delta_rad, bearing_rad)
-    lowest = np.clip(grid.first_bin, 0, bins)
-    highest = np.clip(grid.first_bin + window, 0, bins)
-    m = len(grid.delta_rad)
+    shape = (len(signals), len(grid.distance_m), len(grid.delta_rad))
+    signal = np.zeros((*shape, n_zones, window), np.float32)
+    visible = np.zeros((*shape, len(planes), n_zones), np.float32)
+    if background is not None:
+        whole = plane_light(ViewSignals(None, sensor), background, bearing_rad, _COARSE_M).sum(axis=-1)
     for c, one in enumerate(signals):
-        for i, first in enumerate(grid.first_bin):
-            row = views[i * m : (i + 1) * m]
-            counts = one.counts(row, workers) if counts_of is None else counts_of(c, i, row)
-            low, high = int(lowest[i]), int(highest[i])
+        for i, (distance_m, first) in enumerate(zip(grid.distance_m, grid.first_bin.tolist(), strict=True)):
+            views = Views.broadcast(distance_m, grid.delta_rad, bearing_rad)
+            if background is None:
+                counts = one.counts(views, workers)
+            else:
+                found = one.surfaces(views, background, workers, finest_m=_COARSE_M)
+                counts, visible[c, i] = found[:, 0], found[:, planes].sum(axis=-1) / np.maximum(whole, 1e-300)
+            low, high = max(first, 0), min(first + window, bins)
             signal[c, i, :, :, low - first : high - first] = counts[:, :, low:high]
     u = (np.arange(window) + 0.5 - window / 2) / (window / 2)
     basis = np.stack([np.ones(window), u, u**2], axis=1)
@@ -167,7 +177,15 @@ def build_table(
     light = moments[..., 0].max(axis=(0, 2))
     steps = (float(grid.distance_m[1] - grid.distance_m[0]), float(grid.delta_rad[1] - grid.delta_rad[0]))
     origin = np.array([grid.distance_m[0], steps[0], grid.delta_rad[0], steps[1]])
-    return Table(signal, moments, light > _DARK * light.max(), grid.first_bin, basis, origin, grid.cyclic)
+    return Table(signal, moments, light > _DARK * light.max(), grid.first_bin, basis, origin, grid.cyclic, visible)
+
+
+def plane_light(
+    nothing: ViewSignals, background: Background, bearing_rad: float, finest_m: float | None = None
+) -> NDArray[np.float64]:
+    """Return the counts of each plane with nothing before it, (planes, zones, bins)."""
+    found = nothing.surfaces(Views.broadcast(1.0, 0.0, bearing_rad), background, finest_m=finest_m)
+    return np.ascontiguousarray(found[0, list(planes_of(background))])
 
 
 def _window(

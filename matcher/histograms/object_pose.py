@@ -7,7 +7,7 @@ adds to the variance, and the covariance is then taken from the scatter of the h
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -17,12 +17,13 @@ from scipy import special
 from scipy.stats import chi2
 
 from phasemark import UsageError
-from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene
+from phasemark.matcher.estimate.solver import descend
+from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene, displaced
 from phasemark.render.direct.histogram_frames import HistogramFrames
 
 _MOST_STEPS = 12
-_DONE = 1e-2  # of a standard deviation: what is left of a search that converges quadratically is far less
-_LEAST_SHRINK = 0.05
+_DONE = 1e-4  # squared standard deviations: what is left of a search that converges quadratically is far less
+_SHARES = (1.0, 1 / 3, 1 / 9)
 _MOST_SUPPORT = 20.0
 _LARGEST_STEP = {"m": 0.02, "rad": 0.15}
 _WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
@@ -102,11 +103,7 @@ class ObjectPose:
             "displacement": dict(zip(POSE_PARAMETERS, self.displacement.tolist(), strict=True)),
             "free": list(self.free),
             "covariance": self.covariance.tolist(),
-            "support": self.support,
-            "chi2": self.chi2,
-            "dof": self.dof,
-            "p_value": self.p_value,
-            "accepted": self.accepted,
+            **{name: getattr(self, name) for name in ("support", "chi2", "dof", "p_value", "accepted")},
         }
 
 
@@ -269,54 +266,51 @@ def match_jointly(
     move = np.array(start, dtype=np.float64)
     if move.shape != (6,):
         raise UsageError(f"'start' must have 6 numbers, got {move.shape}")
-    limits = np.array(
-        [_LARGEST_STEP["m" if name.endswith("_m") else "rad"] if name != "support" else 1.0 for name in free]
-    )
+    limits = np.array([_LARGEST_STEP.get(name.rpartition("_")[2], 1.0) for name in free])
 
-    def look(values: NDArray[np.float64], ratio: float) -> Evidence:
+    def at(values: NDArray[np.float64], ratio: float) -> _Supposed:
         parts = [
             evidence_of(one.linearise(seen, poses, values, ratio, free), seen.zone_counts, model_error)
             for seen, poses, one in sensors
         ]
-        return parts[0] if len(parts) == 1 else Evidence.joined(parts)
+        return _Supposed(at, tuple(free), values, ratio, parts[0] if len(parts) == 1 else Evidence.joined(parts))
 
-    def stepped(step: NDArray[np.float64], shrink: float) -> tuple[NDArray[np.float64], float]:
-        values, ratio = move.copy(), support
-        for name, change in zip(free, step * shrink, strict=True):
-            if name == "support":
-                ratio = float(np.clip(support + change, support / 3, min(3 * support, _MOST_SUPPORT)))
-            else:
-                values[POSE_PARAMETERS.index(name)] += change
-        return values, ratio
-
-    here = look(move, support)
-    steps = 0
-    while steps < _MOST_STEPS:
-        steps += 1
-        step, covariance = solve_jointly(here, limits)
-        std = np.sqrt(np.diag(covariance))
-        if (np.abs(step) <= _DONE * np.where(np.isfinite(std), std, np.inf)).all():
-            break
-        step = step / max(1.0, float((np.abs(step) / limits).max()))
-        shrink, better = 1.0, None
-        while shrink > _LEAST_SHRINK:
-            values, ratio = stepped(step, shrink)
-            there = look(values, ratio)
-            if there.chi2.sum() <= here.chi2.sum():
-                better = (values, ratio, there)
-                break
-            shrink /= 3
-        if better is None:
-            break
-        move, support, here = better
-    _, covariance = solve_jointly(here, limits, robust=model_error != POISSON)
+    here, _, steps = descend(at(move, support), limits, most=_MOST_STEPS, done=_DONE, shares=_SHARES)
+    _, covariance = solve_jointly(here.evidence, limits, robust=model_error != POISSON)
     common = {"m": systematic[0], "rad": systematic[1]}
     covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
-    total, dof = float(here.chi2.sum()), int(here.dof.sum()) - len(free)
+    dof = int(here.evidence.dof.sum()) - len(free)
     return ObjectPose(
-        move, sensors[0][2].moved(move), tuple(free), covariance, support, total, dof,
-        bool(chi2.sf(total, dof) > false_alarm), steps,
+        here.displacement, sensors[0][2].moved(here.displacement), here.free, covariance, here.support, here.cost, dof,
+        bool(chi2.sf(here.cost, dof) > false_alarm), steps,
     )  # fmt: skip
+
+
+class _Supposed(NamedTuple):
+    """Supposed pose of an object, with the evidence of all histograms there: a point of a descent."""
+
+    at: Callable[[NDArray[np.float64], float], _Supposed]
+    free: tuple[str, ...]
+    displacement: NDArray[np.float64]
+    support: float
+    evidence: Evidence
+
+    @property
+    def cost(self) -> float:
+        return float(self.evidence.chi2.sum())
+
+    @property
+    def information(self) -> NDArray[np.float64]:
+        return np.asarray(self.evidence.information.sum(axis=(0, 1)))
+
+    @property
+    def gradient(self) -> NDArray[np.float64]:
+        return np.asarray(self.evidence.gradient.sum(axis=(0, 1)))
+
+    def moved(self, step: NDArray[np.float64]) -> _Supposed:
+        step_of = dict(zip(self.free, step.tolist(), strict=True))
+        values, ratio = displaced(self.displacement, self.support, step_of)
+        return self.at(values, min(max(ratio, self.support / 3), 3 * self.support, _MOST_SUPPORT))
 
 
 def _by_sensor(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -171,39 +172,39 @@ def ambient_step(own, step, ambient):  # type: ignore[no-untyped-def]
         ambient[z] = max(ambient[z] + change / own[z, q], LEAST_COUNT)
 
 
-@kernel
-def bare_deviance(counts, extra, cycles, level, ambient):  # type: ignore[no-untyped-def]
-    """Return the deviance of a scene without a landmark, the ambient light of every zone at its best; fill both."""
-    deviance = 0.0
-    share = 0.0 if math.isinf(cycles) else 1.0 / cycles
-    n_zones, n_bins = counts.shape
-    for z in range(n_zones):
-        light, total, glass = 0.0, 0.0, 0.0
-        for j in range(n_bins):
-            total += counts[z, j]
-            glass += extra[j]
-        if share > 0.0:
-            total = -cycles * math.log1p(-min(total * share, 0.999999))
-        light = max((total - glass) / n_bins, LEAST_COUNT)
-        for _ in range(_BARE_STEPS):
-            gradient, information, through, own = 0.0, 0.0, 1.0, 0.0
-            for j in range(n_bins):
-                count = light + extra[j]
-                slope, after = 1.0, 1.0
-                if share > 0.0:
-                    after = through * math.exp(-count * share)
-                    count = cycles * (through - after)
-                    slope = after - count * share * j
-                through = after
-                count = max(count, LEAST_COUNT)
-                level[z, j] = count
-                own += log_term(counts[z, j], count)
-                gradient += slope * (counts[z, j] / count - 1.0)
-                information += slope * slope / count
-            ambient[z] = light
-            light = max(light + gradient / information, LEAST_COUNT)
-        deviance += own
-    return deviance
+class FrameSums(NamedTuple):
+    """Likelihood of one frame; see :func:`frame_sums`."""
+
+    deviance: float
+    level: NDArray[np.float64]
+    information: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    own: NDArray[np.float64]
+
+
+def sums_of_frame(
+    counts: NDArray[np.float64], signal: NDArray[np.float64], slope: NDArray[np.float64], bright: float,
+    ambient: NDArray[np.float64], extra: NDArray[np.float64], cycles: float,
+) -> FrameSums:  # fmt: skip
+    """Return the likelihood of one frame with its information and gradient; arguments as for :func:`frame_sums`."""
+    q, shape = len(slope) + 1, signal.shape
+    level, information, gradient, own = np.empty(shape), np.empty((q, q)), np.empty(q), np.empty((len(signal), q + 2))
+    deviance = frame_sums(
+        counts, signal, slope, bright, ambient, extra, cycles, level, information, gradient, own, np.empty((2, q + 1))
+    )
+    return FrameSums(deviance, level, information, gradient, own)
+
+
+def bare_deviance(counts: NDArray[np.float64], extra: NDArray[np.float64], cycles: float) -> float:
+    """Return the deviance of a scene without a landmark, the ambient light of every zone at its best."""
+    total = counts.sum(axis=1)
+    if not math.isinf(cycles):
+        total = -cycles * np.log1p(-np.minimum(total / cycles, 0.999999))
+    ambient = np.maximum((total - extra.sum()) / counts.shape[1], LEAST_COUNT)
+    for _ in range(_BARE_STEPS):
+        sums = sums_of_frame(counts, np.zeros(counts.shape), np.empty((0, *counts.shape)), 1.0, ambient, extra, cycles)
+        ambient_step(sums.own, np.zeros(1), ambient)
+    return sums.deviance
 
 
 def deviance_of(counts: NDArray[np.float64], level: NDArray[np.float64]) -> float:

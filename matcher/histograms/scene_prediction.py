@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -136,21 +136,21 @@ class ObjectScene:
 
         slopes = []
         for name in free:
-            step = _STEPS[name]
-            sides = []
-            for sign in (1, -1):
-                if name == "support":
-                    side = shape(move, support * (1 + sign * step))
-                else:
-                    other = move.copy()
-                    other[POSE_PARAMETERS.index(name)] += sign * step
-                    side = shape(other, support)
-                sides.append(piled(bright * side))
-            slopes.append((sides[0] - sides[1]) / (2 * step * (support if name == "support" else 1.0)))
+            step = _STEPS[name] * (support if name == "support" else 1.0)
+            sides = [piled(bright * shape(*displaced(move, support, {name: by}))) for by in (step, -step)]
+            slopes.append((sides[0] - sides[1]) / (2 * step))
         expected = piled(bright * here)
         brighter = (piled(bright * here * 1.001) - expected) / 0.001
         slope = np.stack(slopes, axis=-1) if slopes else np.zeros((*expected.shape, 0))
         return Linearised(expected, slope, brighter)
+
+
+def displaced(
+    displacement: NDArray[np.float64], support: float, step: Mapping[str, float]
+) -> tuple[NDArray[np.float64], float]:
+    """Return displacement and albedo of the support after a step, by parameter."""
+    moves = np.array([step.get(name, 0.0) for name in POSE_PARAMETERS])
+    return displacement + moves, support + step.get("support", 0.0)
 
 
 def shifted(counts: NDArray[np.float64], bins: NDArray[np.float64]) -> NDArray[np.float64]:

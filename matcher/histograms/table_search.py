@@ -1,4 +1,4 @@
-"""Initial guesses from a table of histograms: its grid by moments of every zone, then a descent between its nodes.
+"""Initial guesses from a table of histograms: by moments and a descent, or by least squares before planes.
 
 Pile-up is taken off the counts first, and ambient light is that of the bins without a peak; both are good enough for
 where a likelihood has its hills. What is found is refined with exact scenes afterwards.
@@ -26,25 +26,32 @@ _STEPS = 8
 _HALVINGS = 3
 _DONE = 0.05  # of a standard deviation
 _HOPE = 4.0  # the most that can still be gained, over the gain that a step promises
+_ROUNDS = 6
+"""Of a descent that varies one brightness after another."""
+_MOST = 3
+"""Lowest minima of a table's nodes that are followed, of each class."""
 
 
-class Hills(NamedTuple):
-    """Local maxima of the likelihood of one frame, best first.
+class TableStart(NamedTuple):
+    """A place in a table where a frame may come from.
 
     Parameters
     ----------
-    class_index : (k,) int64
-    place : (k, 2) float64
+    class_index : int
+    place : (2,) float64
         Distance and δ.
-    bright : (k,) float64
-    cost : (k,) float64
-        Deviance of the frame there.
+    bright : float
+    ratios : (planes,) float64
+        Brightness of each plane over that of the landmark.
+    cost : float
+        Deviance of the frame there; before planes, its weighted squared distance from the node.
     """
 
-    class_index: NDArray[np.int64]
+    class_index: int
     place: NDArray[np.float64]
-    bright: NDArray[np.float64]
-    cost: NDArray[np.float64]
+    bright: float
+    ratios: NDArray[np.float64]
+    cost: float
 
 
 def ambient_light(counts: NDArray[np.float64], extra: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -60,9 +67,9 @@ def ambient_light(counts: NDArray[np.float64], extra: NDArray[np.float64]) -> ND
 
 def find_hills(
     table: Table, counts: NDArray[np.float64], ambient: NDArray[np.float64], extra: NDArray[np.float64],
-    n_frames: float, most: int = 3, limit: float = math.inf,
-) -> Hills:  # fmt: skip
-    """Return where the likelihood of one frame has hills.
+    n_frames: float, limit: float = math.inf,
+) -> list[TableStart]:  # fmt: skip
+    """Return where the likelihood of one frame has hills, and its deviance there.
 
     Parameters
     ----------
@@ -74,8 +81,6 @@ def find_hills(
         Counts of the cover glass.
     n_frames : float
         Frames that were added up.
-    most : int
-        Lowest minima of the grid that are followed, of each class.
     limit : float
         A descent that cannot come below this is given up; so is one that cannot come near the best before it.
     """
@@ -85,39 +90,70 @@ def find_hills(
     _whiten(table, counts, ambient, extra, white, seen, np.empty((STATISTICS, STATISTICS)), unexplained)
     cost, bright = np.empty((n_classes, n_distance, n_delta)), np.empty((n_classes, n_distance, n_delta))
     _grid_costs(table, n_frames, white, seen, unexplained, cost, bright)
-    starts = [(c, *node) for c in range(n_classes) for node in grid_minima(cost[c], table.cyclic, most).tolist()]
+    starts = [(c, *node) for c in range(n_classes) for node in grid_minima(cost[c], table.cyclic)]
     starts.sort(key=lambda node: float(cost[node]))
     dark_cost = np.empty(counts.shape)
     total = _dark_deviance(counts, ambient, extra, dark_cost)
-    place, scale, found = np.empty((len(starts), 2)), np.empty(len(starts)), np.empty(len(starts))
-    signal, nodes = np.empty((3, *counts.shape)), np.empty((4, 4))
-    information, gradient = np.empty((3, 3)), np.empty(3)
-    for k, (c, i, j) in enumerate(starts):
-        place[k] = table.grid[0] + table.grid[1] * i, table.grid[2] + table.grid[3] * j
-        scale[k], found[k] = _descend(
-            table, c, counts, ambient, extra, n_frames, dark_cost, total, limit, place[k], bright[c, i, j], signal,
+    signal, nodes, information, gradient = np.empty((3, *counts.shape)), np.empty((4, 4)), np.empty((3, 3)), np.empty(3)
+    hills = []
+    for c, i, j in starts:
+        place = _place_of(table, i, j)
+        scale, found = _descend(
+            table, c, counts, ambient, extra, n_frames, dark_cost, total, limit, place, bright[c, i, j], signal,
             nodes, information, gradient,
         )  # fmt: skip
-        limit = min(limit, found[k] + DESCENT_MARGIN)
-    order = np.argsort(found, kind="stable")
-    return Hills(np.array([c for c, *_ in starts])[order], place[order], scale[order], found[order])
+        limit = min(limit, found + DESCENT_MARGIN)
+        hills.append(TableStart(c, place, scale, np.empty(0), found))
+    return hills
 
 
-def grid_minima(cost: NDArray[np.float64], cyclic: bool, most: int) -> NDArray[np.int64]:
-    """Return the lowest nodes that lie below their neighbours, (k, 2); the last angle may be followed by the first."""
+def find_hills_before(
+    table: Table, counts: NDArray[np.float64], ambient: NDArray[np.float64], extra: NDArray[np.float64],
+    n_frames: float, light: NDArray[np.float64],
+) -> list[TableStart]:  # fmt: skip
+    """Return the lowest minima of a table before planes, the brightness of every surface at its best; best first.
+
+    Parameters
+    ----------
+    table, counts, ambient, extra, n_frames
+        As for :func:`find_hills`.
+    light : (planes, zones, bins) float64
+        Counts of the planes in one frame, with nothing before them.
+    """
+    net = counts - ambient[:, None] - extra
+    weight = 1 / np.maximum(np.maximum(ambient[:, None] + extra, counts), 1.0)
+    light = n_frames * light
+    power = np.einsum("pzj,qzj,zj->zpq", light, light, weight)
+    along = np.einsum("pzj,zj,zj->zp", light, net, weight)
+    shape = table.signal.shape[:3]
+    cost, scales = np.empty(shape), np.empty((*shape, 1 + len(light)))
+    q = 1 + len(light)
+    _costs_before(table, n_frames, net, weight, light, power, along, float((weight * net**2).sum()),
+                  np.empty((q, q + 1)), np.empty(q), cost, scales)  # fmt: skip
+    starts = []
+    for c in range(len(cost)):
+        for node in grid_minima(cost[c], table.cyclic):
+            bright, *of_planes = scales[c][node]
+            ratios = np.array(of_planes) / bright
+            starts.append(TableStart(c, _place_of(table, *node), float(bright), ratios, float(cost[c][node])))
+    return sorted(starts, key=lambda start: start.cost)
+
+
+def _place_of(table: Table, i: int, j: int) -> NDArray[np.float64]:
+    """Return distance and δ of a node."""
+    return np.array([table.grid[0] + table.grid[1] * i, table.grid[2] + table.grid[3] * j])
+
+
+def grid_minima(cost: NDArray[np.float64], cyclic: bool) -> list[tuple[int, int]]:
+    """Return the lowest nodes that lie below their neighbours; the last angle may be followed by the first."""
     n, m = cost.shape
-    padded = np.full((n + 2, m + 2), np.inf)
-    padded[1:-1, 1:-1] = cost
+    padded = np.pad(cost, 1, constant_values=np.inf)
     if cyclic:
         padded[1:-1, 0], padded[1:-1, -1] = cost[:, -1], cost[:, 0]
-    low = np.ones(cost.shape, bool)
-    for a in range(3):
-        for b in range(3):
-            if (a, b) != (1, 1):
-                low &= cost <= padded[a : a + n, b : b + m]
-    nodes = np.argwhere(low)
-    order = np.argsort(cost[low], kind="stable")[:most]
-    return np.asarray(nodes[order])
+    around = [padded[a : a + n, b : b + m] for a in range(3) for b in range(3)]
+    low = cost <= np.minimum.reduce(around)
+    order = np.argsort(cost[low], kind="stable")[:_MOST]
+    return [(int(i), int(j)) for i, j in np.argwhere(low)[order]]
 
 
 @kernel
@@ -281,3 +317,64 @@ def _descend(  # type: ignore[no-untyped-def]
         d_m, d_rad, d_bright = d_m / longest, d_rad / longest, d_bright / longest
     place[0], place[1] = at_m, at_rad
     return at_bright, best_cost
+
+
+@kernel
+def _costs_before(  # type: ignore[no-untyped-def]
+    table, n_frames, net, weight, light, power, along, whole, normal, best, cost, scales,
+):  # fmt: skip
+    """Fill the least weighted squared distance of the frame from every node, and the brightness of each surface."""
+    n_classes, n_distance, n_delta, n_zones, width = table.signal.shape
+    n_planes, _, n_bins = light.shape
+    q = 1 + n_planes
+    for c in range(n_classes):
+        for i in range(n_distance):
+            first = table.first_bin[i]
+            low, high = max(first, 0), min(first + width, n_bins)
+            for j in range(n_delta):
+                for a in range(q):
+                    for b in range(q + 1):
+                        normal[a, b] = 0.0
+                for z in range(n_zones):
+                    share = table.visible[c, i, j]
+                    if table.lit[i, z]:
+                        row = table.signal[c, i, j, z]
+                        for m in range(low, high):
+                            s = row[m - first] * n_frames
+                            w = s * weight[z, m]
+                            normal[0, 0] += w * s
+                            normal[0, q] += w * net[z, m]
+                            for p in range(n_planes):
+                                normal[0, 1 + p] += w * share[p, z] * light[p, z, m]
+                    for p in range(n_planes):
+                        normal[1 + p, q] += share[p, z] * along[z, p]
+                        for r in range(p, n_planes):
+                            normal[1 + p, 1 + r] += share[p, z] * share[r, z] * power[z, p, r]
+                cost[c, i, j] = whole + _least(normal, best)
+                for a in range(q):
+                    scales[c, i, j, a] = best[a]
+
+
+@kernel
+def _least(normal, best):  # type: ignore[no-untyped-def]
+    """Fill the brightness of each surface that explains a frame best; returns by how much that lowers the cost.
+
+    `normal` has the upper triangle of the normal equations and their right side as its last column.
+    """
+    q = len(best)
+    for a in range(q):
+        best[a] = 0.0
+    for _ in range(_ROUNDS):  # coordinate descent, for each stays within its bounds
+        for a in range(q):
+            rest = normal[a, q]
+            for b in range(q):
+                if b != a:
+                    rest -= normal[min(a, b), max(a, b)] * best[b]
+            best[a] = rest / max(normal[a, a], 1e-30)
+            best[a] = min(max(best[a], DIMMEST), BRIGHTEST) if a == 0 else max(best[a], 0.0)
+    total = 0.0
+    for a in range(q):
+        total -= 2 * best[a] * normal[a, q]
+        for b in range(q):
+            total += best[a] * best[b] * normal[min(a, b), max(a, b)]
+    return total

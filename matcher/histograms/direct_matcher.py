@@ -1,0 +1,138 @@
+"""The base of matchers of histograms and of targets: landmarks of a bank, the region that is searched, and threads."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank
+from phasemark.matcher.estimate.acceptance import Rules
+from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, plan_table
+from phasemark.matcher.histograms.scene_models import planes_of
+from phasemark.matcher.match import Match
+from phasemark.render import Background, Sensor
+from phasemark.render.direct.bin_counts import response_share
+from phasemark.render.direct.footprints import histogram_of
+from phasemark.render.direct.view_signals import ViewSignals
+from phasemark.render.view import VIEW_FIELDS
+
+_WIDEST_BEARING_RAD = math.radians(4.0)
+_BEARING_SIGMA = 2.0
+"""A free bearing has two further tables of histograms, as far aside as these say."""
+_STEEPEST_RAD = math.radians(20.0)
+_NEAREST_WALL_M = 0.1
+_T = TypeVar("_T")
+
+
+class DirectMatcher:
+    """Landmarks of a bank before a direct sensor.
+
+    Parameters
+    ----------
+    bank : Bank
+        Its meshes and the span of its grid are used. Its images are not: histograms are rendered when the first frames
+        come, which takes some seconds and :attr:`table_bytes` of memory.
+    prior_std : sequence of float
+        Standard deviation of each free parameter before a frame is seen, about 0; infinite where nothing is known.
+    rules : Rules
+        When an answer is accepted.
+    background : Background, "auto" or None
+        What stands behind the landmark. "auto": a wall whose distance is estimated.
+    workers : int
+        Threads; the answers do not depend on their number.
+    """
+
+    def __init__(
+        self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
+        background: Background | Literal["auto"] | None = None, workers: int = 1,
+    ) -> None:  # fmt: skip
+        self.sensor = bank.camera
+        check_histogram_sensor(bank)
+        self.rules, self.free, self.workers = rules, rules.free, workers
+        self.prior_std = np.array(prior_std, dtype=np.float64)
+        self.prior_weight, self.columns = 1 / self.prior_std**2, [VIEW_FIELDS.index(name) for name in self.free]
+        meshes = [bank.mesh(name) for name in bank.classes]
+        self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
+        self.nothing = ViewSignals(None, self.sensor)
+        self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
+        histogram = histogram_of(self.sensor)
+        far_m = histogram.start_m + histogram.bins * histogram.bin_width_m
+        self.free_wall = (_NEAREST_WALL_M, far_m) if background == "auto" else None
+        behind = Background(wall_m=far_m) if isinstance(background, str) else background
+        self.background = behind if planes_of(behind) else None
+        self.limits = _view_limits(self.grid, None if self.free_wall else self.background)
+
+    def _built_table(self, bearing_rad: float) -> Table:
+        """Render histograms on the grid."""
+        return build_table(self.signals, self.grid, self.background, bearing_rad, self.workers)
+
+    @property
+    def _bearings_rad(self) -> tuple[float, ...]:
+        """Bearings at which a table is made."""
+        if "bearing_rad" not in self.free:
+            return (0.0,)
+        side = min(_BEARING_SIGMA * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
+        return (0.0, -side, side)
+
+    def _on_threads(self, work: Callable[[_T], Match], frames: Sequence[_T]) -> list[Match]:
+        """Return the answer for each frame."""
+        if self.workers == 1 or len(frames) < 2:
+            return [work(one) for one in frames]
+        with ThreadPoolExecutor(self.workers) as pool:
+            return list(pool.map(work, frames))
+
+
+def check_histogram_sensor(bank: Bank) -> None:
+    """Refuse a bank whose sensor counts no histograms.
+
+    Raises
+    ------
+    UsageError
+    """
+    if bank.camera.kind != "direct" or bank.camera.histogram is None:
+        lacks = "without a [histogram] table" if bank.camera.kind == "direct" else "a phase camera"
+        raise UsageError(
+            f"histograms and targets take a bank of a direct sensor with a [histogram] table: '{bank.plan.sensor}' is"
+            f" {'one ' if bank.camera.kind == 'direct' else ''}{lacks}"
+        )
+
+
+def refuse_other_sensor(own: Sensor, other: Sensor) -> None:
+    """Refuse frames that were taken with another sensor.
+
+    Raises
+    ------
+    UsageError
+    """
+    difference = other.optics_difference(own)
+    if difference is None and other.histogram != own.histogram:
+        ours, theirs = histogram_of(own).model_dump(), histogram_of(other).model_dump()
+        name = next(name for name in ours if ours[name] != theirs[name])
+        difference = f"'histogram.{name}' is {theirs[name]} here and {ours[name]} there"
+    if difference is not None:
+        raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+
+
+def _view_limits(grid: TableGrid, background: Background | None) -> NDArray[np.float64]:
+    """Return least and greatest values of a view, (2, 6); the landmark's axis is no farther away than a wall."""
+    low, high = np.full(len(VIEW_FIELDS), -math.inf), np.full(len(VIEW_FIELDS), math.inf)
+    low[0], high[0] = grid.distance_m[0], grid.distance_m[-1]
+    if background is not None and background.wall_m is not None:
+        high[0] = max(min(high[0], background.wall_m), low[0])
+    if not grid.cyclic:
+        low[1], high[1] = grid.delta_rad[0], grid.delta_rad[-1]
+    low[4:], high[4:] = -_STEEPEST_RAD, _STEEPEST_RAD
+    return np.stack([low, high])
+
+
+def glass_counts(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the expected counts of the cover glass in one frame, (bins,)."""
+    histogram = histogram_of(sensor)
+    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
+    return np.asarray(histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram)))
