@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from phasemark.render.sensor.sensor_file import sensor_toml
 
 SIGMA_BINS = 1.5
 WIDTH_M = 0.0137
+FIRST = "position 0, frame 0, row 0, column 0"
 
 
 def one_zone(**changes: object) -> Sensor:
@@ -53,51 +55,36 @@ def test_counts_have_the_mean_and_the_variance_of_poisson() -> None:
     assert (got == np.rint(got)).all()
 
 
-def test_a_frame_can_be_drawn_by_itself_and_workers_do_not_matter() -> None:
-    means = np.random.default_rng(1).uniform(0, 800, (3, 1, 128))
-    all_at_once = capture_histograms(means, one_zone(), rng=np.random.default_rng(5), n_frames=4, workers=3).counts
-    alone = capture_histograms(
-        means[2:], one_zone(), rng=np.random.default_rng(5), n_frames=1, first_view=2, first_frame=3
-    ).counts
-    assert (all_at_once[2, 3] == alone[0, 0]).all()
+def centroid(mean: np.ndarray, top: int) -> float:
+    window, middle = slice(top - 4, top + 5), np.arange(128) + 0.5
+    return float(mean[window] @ middle[window] / mean[window].sum())
 
 
-@pytest.mark.parametrize("where", [40.0, 40.27, 40.5])
-def test_centroid_of_a_peak_is_that_of_its_window_and_its_spread_is_its_sigma(where: float) -> None:
-    reach, n = 4, 3000
-    sensor = one_zone(estimator="centroid", estimator_bins=reach)
-    mean = gaussian_counts([where], 4e4, 25.0)
-    frames = capture_histograms(mean[None, None], sensor, rng=np.random.default_rng(11), n_frames=n)
+def parabola(mean: np.ndarray, top: int) -> float:
+    a, b, c = mean[top - 1 : top + 2]
+    return float(top + 0.5 + 0.5 * (a - c) / (a - 2 * b + c))
+
+
+@pytest.mark.parametrize(
+    ("estimator", "closed_form", "where", "counts"),
+    [("centroid", centroid, where, 4e4) for where in (40.0, 40.27, 40.5)]
+    # the law of a parabola is of first order: bright enough for it
+    + [("parabola", parabola, where, 4e6) for where in (40.3, 40.5, 40.7)],
+)
+def test_estimate_of_a_peak_is_its_closed_form_and_its_spread_is_its_sigma(
+    estimator: str, closed_form: Callable[[np.ndarray, int], float], where: float, counts: float
+) -> None:
+    n, signal = 3000, gaussian_counts([where], counts, 0.0)
+    sensor = one_zone(estimator=estimator, estimator_bins=4)
+    frames = capture_histograms(signal[None, None] + 25.0, sensor, rng=np.random.default_rng(11), n_frames=n)
     targets = find_targets(frames)
     place = targets.distance_m.ravel() / WIDTH_M
-    # the closed form: of a Gaussian in bins, cut at the window about the highest bin
-    signal, middle = mean - 25.0, np.arange(128) + 0.5
     tops = frames.counts.reshape(n, 128).argmax(axis=1)
-    expected = np.mean([
-        signal[t - reach : t + reach + 1] @ middle[t - reach : t + reach + 1] / signal[t - reach : t + reach + 1].sum()
-        for t in tops
-    ])  # fmt: skip
     sigma_bins = targets.sigma_m.mean() / WIDTH_M
-    assert abs(place.mean() - expected) < 3 * sigma_bins / np.sqrt(n)
+    assert abs(place.mean() - np.mean([closed_form(signal, top) for top in tops])) < 3 * sigma_bins / np.sqrt(n)
     low, high = chi2.ppf([5e-4, 1 - 5e-4], n - 1) / (n - 1)
     if len(set(tops)) == 1:  # otherwise the window itself moves
         assert low < place.var(ddof=1) / sigma_bins**2 < high
-
-
-@pytest.mark.parametrize("where", [40.3, 40.5, 40.7])
-def test_parabola_of_a_peak_is_that_through_its_three_highest_bins(where: float) -> None:
-    n = 3000
-    mean = gaussian_counts([where], 4e6, 25.0)  # the law is of first order: bright enough for it
-    frames = capture_histograms(
-        mean[None, None], one_zone(estimator="parabola"), rng=np.random.default_rng(12), n_frames=n
-    )
-    targets = find_targets(frames)
-    a, b, c = mean[39:42]
-    expected = 40.5 + 0.5 * (a - c) / (a - 2 * b + c)
-    place = targets.distance_m.ravel() / WIDTH_M
-    assert abs(place.mean() - expected) < 3 * place.std() / np.sqrt(n)
-    low, high = chi2.ppf([5e-4, 1 - 5e-4], n - 1) / (n - 1)
-    assert low < place.var(ddof=1) / (targets.sigma_m.mean() / WIDTH_M) ** 2 < high
 
 
 def test_two_equal_targets_merge_below_two_sigma_of_the_response() -> None:
@@ -133,10 +120,8 @@ def test_targets_come_nearest_first_and_at_least_the_separation_apart() -> None:
 
 
 def test_nothing_above_the_threshold_is_no_target() -> None:
-    frames = capture_histograms(
-        np.full((1, 1, 128), 20.0), one_zone(threshold=8.0), rng=np.random.default_rng(1), n_frames=50
-    )
-    found = find_targets(frames)
+    dark = np.full((1, 1, 128), 20.0)
+    found = find_targets(capture_histograms(dark, one_zone(threshold=8.0), rng=np.random.default_rng(1), n_frames=50))
     assert (found.status == Status.NO_TARGET).all()
     assert np.isnan(found.distance_m).all()
 
@@ -152,28 +137,21 @@ def test_z_is_the_range_times_the_cosine_of_the_zone() -> None:
 
 
 @pytest.mark.parametrize(
-    ("counts", "message"),
+    ("counts", "sensor", "message"),
     [
-        (np.zeros((1, 1, 64)), "the histograms have 64 bins, but the sensor has 128"),
-        (np.zeros((2, 1, 128)), "the histograms have 2 × 1 zones, but the sensor has 1 × 1"),
-        (np.full((1, 1, 128), -3.0), "counts must not be negative, position 0, frame 0, row 0, column 0, bin 0 has -3"),
-        (np.full((1, 1, 128), np.nan), "counts must not be negative, position 0, frame 0, row 0, column 0, bin 0 has"),
+        (np.zeros((1, 1, 64)), {}, "the histograms have 64 bins, but the sensor has 128"),
+        (np.zeros((2, 1, 128)), {}, "the histograms have 2 × 1 zones, but the sensor has 1 × 1"),
+        (np.full((1, 1, 128), -3.0), {}, f"counts must not be negative, {FIRST}, bin 0 has -3"),
+        (np.full((1, 1, 128), np.nan), {}, f"counts must not be negative, {FIRST}, bin 0 has"),
+        (np.full((1, 1, 128), 10.0), {"pile_up": True, "cycles": 1000}, f"a histogram is saturated: {FIRST} has 1280"),
+        (np.zeros((1, 1, 128)), None, r"the sensor has no \[histogram\] table"),
     ],
 )
-def test_histograms_that_cannot_be_are_refused_in_one_line(counts: np.ndarray, message: str) -> None:
+def test_histograms_that_cannot_be_are_refused_in_one_line(
+    counts: np.ndarray, sensor: dict[str, object] | None, message: str
+) -> None:
     with pytest.raises(UsageError, match="^" + message):
-        HistogramFrames(counts, sensor=one_zone())
-
-
-def test_a_saturated_histogram_is_refused() -> None:
-    with pytest.raises(UsageError, match="a histogram is saturated: position 0, frame 0, row 0, column 0 has 1280"):
-        HistogramFrames(np.full((1, 1, 128), 10.0), sensor=one_zone(pile_up=True, cycles=1000))
-
-
-def test_a_sensor_without_a_histogram_table_is_refused() -> None:
-    sensor = one_zone().with_(histogram=None)
-    with pytest.raises(UsageError, match=r"the sensor has no \[histogram\] table"):
-        HistogramFrames(np.zeros((1, 1, 128)), sensor=sensor)
+        HistogramFrames(counts, sensor=one_zone().with_(histogram=None) if sensor is None else one_zone(**sensor))
 
 
 @pytest.mark.parametrize(

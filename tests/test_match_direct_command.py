@@ -72,27 +72,21 @@ def test_frames_of_a_sensor_at_rest_are_added_up(folder: Path, capsys: pytest.Ca
     assert out.count("cone") == 1
 
 
+ON_COUNTS, ON_TARGETS = (*FIXED, "--on", "histograms"), (*FIXED, "--on", "targets")
+
+
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
         (("bank.h5", "log.npz", "--method", "nearest", "--on", "targets"), "--on goes with --method refine"),
-        (("phase.h5", "log.npz", *FIXED, "--on", "histograms"), "take a bank of a direct sensor"),
-        (("bank.h5", "targets.csv", *FIXED, "--on", "histograms"), "match it on targets"),
-        (
-            ("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unknown-background"),
-            "--unknown-background goes with images of ranges",
-        ),
-        (
-            ("bank.h5", "log.npz", *FIXED, "--on", "targets", "--auto-background"),
-            "--auto-background takes histograms",
-        ),
-        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--unit", "mm"), "--unit goes with images of ranges"),
-        (("bank.h5", "log.npz", *FIXED, "--on", "targets", "--robust"), "--robust goes with images of ranges"),
-        (("bank.h5", "log.npz", *FIXED, "--on", "histograms", "--plot", "a.png"), "--plot draws ranges"),
-        (
-            ("bank.h5", "log.npz", *FIXED, "--on", "targets", "--valid-status", "5"),
-            "a valid status goes with targets from CSV",
-        ),
+        (("phase.h5", "log.npz", *ON_COUNTS), "take a bank of a direct sensor"),
+        (("bank.h5", "targets.csv", *ON_COUNTS), "match it on targets"),
+        (("bank.h5", "log.npz", *ON_COUNTS, "--unknown-background"), "--unknown-background goes with images of ranges"),
+        (("bank.h5", "log.npz", *ON_TARGETS, "--auto-background"), "--auto-background takes histograms"),
+        (("bank.h5", "log.npz", *ON_COUNTS, "--unit", "mm"), "--unit goes with images of ranges"),
+        (("bank.h5", "log.npz", *ON_TARGETS, "--robust"), "--robust goes with images of ranges"),
+        (("bank.h5", "log.npz", *ON_COUNTS, "--plot", "a.png"), "--plot draws ranges"),
+        (("bank.h5", "log.npz", *ON_TARGETS, "--valid-status", "5"), "a valid status goes with targets from CSV"),
         (("bank.h5", "log.npz", *FIXED), "match it on histograms"),
     ],
 )
@@ -109,16 +103,9 @@ def test_what_does_not_go_together_is_refused_in_one_line(
 def test_a_frame_set_is_matched_view_by_view_or_frame_by_frame(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plan = {
-        "classes": ("cone",),
-        "views": 2,
-        "distance_m": 1.0,
-        "bearing_deg": 0.0,
-        "frames_per_view": 3,
-        "histograms": True,
-    }
+    plan = {"classes": ("cone",), "views": 2, "distance_m": 1.0, "bearing_deg": 0.0, "frames_per_view": 3}
     for sensor in ("vl53l5cx-8x8", "vl53l5cx-4x4"):
-        build_frames(FramePlan(sensor=sensor, **plan), folder / f"{sensor}.h5").close()
+        build_frames(FramePlan(sensor=sensor, histograms=True, **plan), folder / f"{sensor}.h5").close()
     matched = ("match", folder / "bank.h5", folder / "vl53l5cx-8x8.h5", *FIXED, "--json")
     for on, moving, n in (("histograms", (), 2), ("histograms", ("--moving",), 6), ("targets", ("--moving",), 6)):
         code, out, _ = run(capsys, *matched, "--on", on, *moving)
