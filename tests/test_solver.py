@@ -21,7 +21,7 @@ class Curve:
     @property
     def _off(self) -> np.ndarray:
         a, b, rate = self.at
-        return 2 + 3 * np.exp(-0.7 * self.TIMES) - a - b * np.exp(-rate * self.TIMES)
+        return np.asarray(2 + 3 * np.exp(-0.7 * self.TIMES) - a - b * np.exp(-rate * self.TIMES))
 
     @property
     def _slope(self) -> np.ndarray:
@@ -35,11 +35,11 @@ class Curve:
 
     @property
     def information(self) -> np.ndarray:
-        return self._slope @ self._slope.T
+        return np.asarray(self._slope @ self._slope.T)
 
     @property
     def gradient(self) -> np.ndarray:
-        return self._slope @ self._off
+        return np.asarray(self._slope @ self._off)
 
     def moved(self, step: np.ndarray) -> Curve:
         return Curve(np.minimum(self.at + step, self.highest), self.highest)
