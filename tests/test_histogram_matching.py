@@ -186,23 +186,14 @@ def test_nothing_a_wall_and_another_thing_are_not_accepted() -> None:
 
 
 def test_a_drift_that_the_reference_histogram_shows_is_taken_off() -> None:
-    rng = np.random.default_rng(10)
-    sensor = bank_of().camera
-    h = {**sensor.histogram.model_dump(), "reference_peak": 10.0, "reference_gain": 1.0}
-    bank = build_bank(
-        BankPlan(
-            sensor=SENSOR, sensor_overrides={"histogram": h}, classes=("cone",), distance_m="1.0:1.2:0.1",
-            delta_deg="0:170:10", layout="full",
-        )
-    )  # fmt: skip
-    views = Views.broadcast(1.1, 0.7)
-    signal = 0.8 * renderer_of("cone", sensor).signal(views)[:, 0]
+    rng, sensor = np.random.default_rng(10), bank_of().camera
+    changes = (("reference_peak", 10.0), ("reference_gain", 1.0))
+    matcher = matcher_of(changes=changes, span="1.0:1.2:0.1", classes=("cone",))
+    signal = 0.8 * renderer_of("cone", sensor).signal(Views.broadcast(1.1, 0.7))[:, 0]
     late = detected_counts(np.fft.irfft(np.fft.rfft(signal) * np.exp(-2j * np.pi * np.arange(65) / 128 * 0.6)), sensor)
     counts = rng.poisson(np.maximum(late, 1e-3)).reshape(1, 1, 8, 8, 128)
     reference = np.exp(-0.5 * ((np.arange(32) - 10.6) / 1.5) ** 2).reshape(1, 1, 32) * 1e4
-    found = Matcher(bank, "refine", free=FREE, on="histograms", workers=1).match(
-        HistogramFrames(counts, sensor=bank.camera, reference=reference)
-    )
+    found = matcher.match(HistogramFrames(counts, sensor=matcher.bank.camera, reference=reference))
     assert abs(found.distance_m[0] - 1.1) < 5 * math.sqrt(found.covariance[0, 0, 0])
 
 
