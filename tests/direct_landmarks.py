@@ -118,7 +118,8 @@ def trials(
         scaled = error / np.sqrt(np.einsum("npp->np", bound.covariance))[right]
         parts.append((scaled, nees(error, found.covariance[right]), found.p_value[right]))
         n_accepted += int(found.accepted.sum())
-    return Trials(n // len(classes) * len(classes), *map(np.concatenate, zip(*parts, strict=True)), n_accepted)
+    scaled, squares, p_values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Trials(n // len(classes) * len(classes), scaled, squares, p_values, n_accepted)
 
 
 def check_bound(found: Trials, slack: float = 0.03) -> None:

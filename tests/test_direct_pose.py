@@ -133,7 +133,7 @@ def test_what_does_not_belong_together_is_refused_in_one_line() -> None:
         (([frames] * 2, [poses] * 2, [SCENE, elsewhere]), {}, "that of sensor 1 is turned about another point"),
     ):
         with pytest.raises(UsageError, match=message):
-            match_jointly(*arguments, **options)  # type: ignore[arg-type]
+            match_jointly(*arguments, **options)
 
 
 def test_two_sensors_on_one_mount_know_the_object_as_their_information_together() -> None:

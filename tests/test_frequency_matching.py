@@ -1,6 +1,7 @@
 """Filters, bounds and matching of cameras with several modulation frequencies (PHYSICS section 10)."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -137,7 +138,7 @@ def scene(bank, background, bearing_std_deg=1.0, seed=5):
 
 WALL = Background(wall_m=3.0)
 # evidence, background, share that is accepted, numbers compared with the bound, slack of the mean NEES
-BOUNDS = {
+BOUNDS: dict[str, tuple[Any, ...]] = {
     "phasors": ("phasors", None, 0.8, VIEW[:3], 1.0),
     # the start is a grid of 2°, and these ranges are good to half a millimetre
     "unwrapped ranges": ("ranges", None, 0.6, VIEW[:1], 1.0),
