@@ -409,12 +409,13 @@ class SweepJob:
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
-        match = self.matcher(method, self.all_conditions[number].wall_m)
+        wall_m = self.all_conditions[number].wall_m
         if method.is_program:
+            match = self.matcher(method, wall_m)
             matches = own_matches(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
         else:
             try:
-                matches = Matches(match(frames))
+                matches = Matches(self.matcher(method, wall_m)(frames))
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):
