@@ -12,7 +12,8 @@ from typing import Any
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
     """Return rows as CSV, text as :func:`as_cell` has it."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(map(as_cell, row) for row in rows)
+    plain = ([as_cell(one) if isinstance(one, str) else one for one in row] for row in rows)
+    csv.writer(text, lineterminator="\n").writerows(plain)
     return text.getvalue()
 
 

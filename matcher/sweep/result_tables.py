@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -369,7 +370,7 @@ _UNKNOWN = Interval(math.nan, math.nan, math.nan)
 def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> bytes:
     """Return columns as CSV; numbers as short as they can be read back exactly, nothing for NaN."""
     rows = zip(*(["" if v != v else v for v in column] for column in table.values()), strict=True)
-    return csv_text([list(table)] * header + list(rows)).encode()
+    return csv_text(itertools.chain([list(table)] * header, rows)).encode()
 
 
 def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
