@@ -172,14 +172,10 @@ def test_a_body_of_revolution_is_matched_at_its_only_angle(files, method):
     assert match.distance_m == pytest.approx(1.0, abs=0.002)
 
 
-def test_a_symmetry_that_the_mesh_has_not_is_doubted(files):
-    with pytest.warns(MeshWarning, match=r"symmetry 3 is stated for 'table', but turned by 120° .* found: 4"):
-        build_bank(plan_of(files, "table", symmetry=3).model_copy(update={"delta_deg": (0.0,)})).close()
-
-
-def test_a_symmetry_that_is_less_than_the_mesh_has_is_doubted(files):
-    with pytest.warns(MeshWarning, match=r"symmetry 2 is stated for 'table', but turned by 90° it is the same: .*: 4"):
-        build_bank(plan_of(files, "table", symmetry=2).model_copy(update={"delta_deg": (0.0,)})).close()
+@pytest.mark.parametrize(("stated", "words"), [(3, "120° .* found: 4"), (2, "90° it is the same: .*: 4")])
+def test_a_symmetry_that_is_not_that_of_the_mesh_is_doubted(files, stated, words):
+    with pytest.warns(MeshWarning, match=rf"symmetry {stated} is stated for 'table', but turned by {words}"):
+        build_bank(plan_of(files, "table", symmetry=stated).model_copy(update={"delta_deg": (0.0,)})).close()
 
 
 def test_the_commands_say_what_was_found(files, tmp_path, capsys):

@@ -28,17 +28,8 @@ ANYWHERE = TrialSetup(
 
 
 @pytest.fixture(scope="module")
-def bank_file(tmp_path_factory):
-    path = tmp_path_factory.mktemp("bank") / "bank.h5"
-    build_bank(PLAN, path).close()
-    return path
-
-
-@pytest.fixture(scope="module")
-def bank(bank_file):
-    from phasemark.data import open_bank
-
-    with open_bank(bank_file) as opened:
+def bank(tmp_path_factory):
+    with build_bank(PLAN, tmp_path_factory.mktemp("bank") / "bank.h5") as opened:
         yield opened
 
 
@@ -211,12 +202,12 @@ def test_options_that_contradict_each_other_are_refused(bank, options, words):
         Matcher(bank, "refine", **options)
 
 
-def test_the_command_frees_pitch_and_roll_and_writes_them(bank_file, renderers, tmp_path, capsys):
+def test_the_command_frees_pitch_and_roll_and_writes_them(bank, tmp_path, capsys):
     recording, table = tmp_path / "r.npz", tmp_path / "e.csv"
     tilt = ["--pitch", "3", "--roll", "-4"]
     simulate = ["frames", "simulate", "-o", str(recording), "--class", "cone", "--delta", "40", "--frames", "50", *tilt]
     assert main(simulate) == 0
-    match = ["match", str(bank_file), str(recording), "--method", "refine", "--free", "roll", "--free", "pitch"]
+    match = ["match", str(bank.path), str(recording), "--method", "refine", "--free", "roll", "--free", "pitch"]
     assert main([*match, "--pitch-std", "5", "--roll-std", "8", "--estimates", str(table)]) == 0
     (row,) = csv.DictReader(table.read_text().splitlines())
     assert row["accepted"] == "true"
