@@ -4,6 +4,7 @@
 """
 
 import sys
+from collections.abc import Callable
 
 import numpy as np
 from builders import pure_image
@@ -37,7 +38,7 @@ def the_rest() -> None:
     exact_pixels("cylinder", PMD, Views.broadcast(1.0, 0.3), np.array([[8, 8]]), background=BEHIND)
 
 
-PARTS = {
+PARTS: dict[str, Callable[[], None]] = {
     "rendering": rendering,
     "rest": the_rest,
     "matching": lambda: warm("match"),
