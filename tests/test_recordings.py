@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from phasemark.cli import main
 from phasemark.data import open_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
-from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.commands.match_table import bank_ends, summary
 from phasemark.matcher.recordings.estimates_table import match_in_batches
 from phasemark.render import Background, Renderer, capture, preset
@@ -157,6 +157,7 @@ def test_answers_do_not_depend_on_the_size_of_a_batch_and_single_frames_have_the
     assert len(found[0]) == N
     assert found[0] == found[1]
     filtered = batches[1][0].filtered
+    assert isinstance(filtered, FilteredFrames)
     returned = np.isfinite(filtered.range_m)
     assert returned.any()
     pooled = filtered.with_pooled_noise()
