@@ -6,6 +6,7 @@ import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -81,7 +82,7 @@ class KnownPoses:
         """Return some of the poses."""
         which = np.arange(len(self))[index]
         place = tuple(self.place[k] for k in which) if self.place else ()
-        arrays = {name: values for name, values in vars(self).items() if name != "place"}
+        arrays: dict[str, Any] = {name: values for name, values in vars(self).items() if name != "place"}
         return KnownPoses(**{name: None if a is None else a[which] for name, a in arrays.items()}, place=place)
 
     def where(self, k: int) -> str:

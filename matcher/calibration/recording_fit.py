@@ -111,7 +111,7 @@ class Sizes:
     @property
     def variance(self) -> _Float:
         """Of both pose errors together, (5,); squares of metres, radians, seconds."""
-        return (self.frame**2 + self.block**2) * _UNIT**2
+        return np.asarray((self.frame**2 + self.block**2) * _UNIT**2)
 
 
 class RecordingFit:
@@ -155,7 +155,7 @@ class RecordingFit:
     def candidates(self, images: Images) -> _Bool:
         """Return which pixels returned and see the landmark, alone and a pixel from its edge unless edges count."""
         there = (images.phasor != 0) & (self.evidence.weight > 0)
-        return there if self.edges else there & self.model.alone(images, from_edges=True)
+        return np.asarray(there if self.edges else there & self.model.alone(images, from_edges=True))
 
     def seen(self, theta: _Float, zone: _Float) -> tuple[_Float, _Bool]:
         """Return the residuals at a place, and which pixels may count."""
@@ -248,8 +248,9 @@ class RecordingFit:
                 out[active] = part
                 return out
 
+            bounds = optimize.Bounds(*limits[active].T)
             found = optimize.minimize(
-                lambda part: cost(whole(part), active), log[active], method="L-BFGS-B", bounds=limits[active],
+                lambda part: cost(whole(part), active), log[active], method="L-BFGS-B", bounds=bounds,
                 options={"eps": 1e-3, "maxiter": 10, "ftol": 1e-6},
             )  # fmt: skip
             return whole(found.x), float(found.fun)

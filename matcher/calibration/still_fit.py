@@ -71,7 +71,7 @@ _POSES_FOR_SANDWICH = 3
 """Poses for each free parameter from which their own scatter tells the covariance."""
 _STD_STARTS = np.log([2e-4, math.radians(0.02), math.radians(0.02)]) + np.array([[0.0], [2.0], [4.0]])
 """Logarithms of the sizes of the poses' errors, metres and radians, where three descents begin."""
-_STD_BOUNDS = np.log([(1e-6, 0.1), (1e-6, math.radians(10.0)), (1e-6, math.radians(10.0))])
+_STD_BOUNDS = optimize.Bounds(np.log([1e-6] * 3), np.log([0.1, math.radians(10.0), math.radians(10.0)]))
 """Nothing is measured better, and nobody would call worse a known pose."""
 
 
@@ -221,7 +221,7 @@ class _Linear:
         eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
         self.pose_information = rows @ rows.transpose(0, 2, 1) - self.cross @ eliminated
         """Of each pose on the mounting, (K, p, p)."""
-        self.information = self.pose_information.sum(axis=0)
+        self.information: NDArray[np.float64] = self.pose_information.sum(axis=0)
 
     def gradients(
         self, residual: NDArray[np.float64], u: NDArray[np.float64]
