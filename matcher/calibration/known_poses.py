@@ -82,8 +82,9 @@ class KnownPoses:
         """Return some of the poses."""
         which = np.arange(len(self))[index]
         place = tuple(self.place[k] for k in which) if self.place else ()
-        arrays: dict[str, Any] = {name: values for name, values in vars(self).items() if name != "place"}
-        return KnownPoses(**{name: None if a is None else a[which] for name, a in arrays.items()}, place=place)
+        arrays = {name: values for name, values in vars(self).items() if name != "place"}
+        taken: dict[str, Any] = {name: None if a is None else a[which] for name, a in arrays.items()}
+        return KnownPoses(**taken, place=place)
 
     def where(self, k: int) -> str:
         """Name one pose in a message."""

@@ -248,7 +248,7 @@ class RecordingFit:
                 out[active] = part
                 return out
 
-            bounds = optimize.Bounds(*limits[active].T)
+            bounds = [(low, high) for low, high in limits[active]]
             found = optimize.minimize(
                 lambda part: cost(whole(part), active), log[active], method="L-BFGS-B", bounds=bounds,
                 options={"eps": 1e-3, "maxiter": 10, "ftol": 1e-6},

@@ -71,7 +71,7 @@ _POSES_FOR_SANDWICH = 3
 """Poses for each free parameter from which their own scatter tells the covariance."""
 _STD_STARTS = np.log([2e-4, math.radians(0.02), math.radians(0.02)]) + np.array([[0.0], [2.0], [4.0]])
 """Logarithms of the sizes of the poses' errors, metres and radians, where three descents begin."""
-_STD_BOUNDS = optimize.Bounds(np.log([1e-6] * 3), np.log([0.1, math.radians(10.0), math.radians(10.0)]))
+_STD_BOUNDS = [(math.log(1e-6), math.log(most)) for most in (0.1, math.radians(10.0), math.radians(10.0))]
 """Nothing is measured better, and nobody would call worse a known pose."""
 
 
