@@ -23,15 +23,15 @@ from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.kalman_filters import kalman_filter
-from phasemark.matcher.sweep import report
 from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.examples import sweep_frames
 from phasemark.matcher.sweep.figures.errors import against_axis, maps
+from phasemark.matcher.sweep.figures.sheet import sweep_figures
 from phasemark.matcher.sweep.figures.trust import confusion
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import Condition, Method, SweepPlan
-from phasemark.matcher.sweep.report import summary
+from phasemark.matcher.sweep.report import summary, write_report
 from phasemark.matcher.sweep.result_tables import SweepTrials
 from phasemark.matcher.sweep.run import read_sweep, run_sweep
 from phasemark.render import Renderer, preset
@@ -181,10 +181,9 @@ def test_the_numbers_of_a_map_are_those_of_its_cells_and_maps_of_ratios_share_on
 
 def test_a_report_regenerates_bit_for_bit(folder, tmp_path, monkeypatch):
     again = shutil.copytree(folder, tmp_path / "again")
-    every = report.sweep_figures
     # each figure takes a second to write: every third, and the page without the others
-    monkeypatch.setattr(report, "sweep_figures", lambda *of: list(every(*of))[::3])
-    report.write_report(again)
+    monkeypatch.setattr("phasemark.matcher.sweep.report.sweep_figures", lambda *of: list(sweep_figures(*of))[::3])
+    write_report(again)
     for file in sorted((folder / "figures").iterdir()):
         assert (again / "figures" / file.name).read_bytes() == file.read_bytes(), file.name
     before, after = (
