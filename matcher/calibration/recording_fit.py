@@ -248,9 +248,12 @@ class RecordingFit:
                 out[active] = part
                 return out
 
+            def cost_of(part: _Float) -> float:
+                return cost(whole(part), active)
+
             bounds = [(low, high) for low, high in limits[active]]
             found = optimize.minimize(
-                lambda part: cost(whole(part), active), log[active], method="L-BFGS-B", bounds=bounds,
+                cost_of, log[active], method="L-BFGS-B", bounds=bounds,
                 options={"eps": 1e-3, "maxiter": 10, "ftol": 1e-6},
             )  # fmt: skip
             return whole(found.x), float(found.fun)

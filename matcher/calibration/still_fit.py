@@ -383,9 +383,13 @@ class StillFit:
         errors = np.einsum("kij,kir->kjr", PoseStd(1.0, 1.0, 1.0).factor(self.model.poses), own)
         exact = place.residual + np.einsum("kir,ki->kr", own, place.shift)
         effects = RandomEffects.of_frames(rows * self.scale[:, None], errors, exact)
+
+        def cost(log: NDArray[np.float64]) -> float:
+            return effects.minus_two_log(np.exp(log)[[0, 0, 1, 2]])  # a lens moves along and across
+
         found = [
             optimize.minimize(
-                lambda log: effects.minus_two_log(np.exp(log)[[0, 0, 1, 2]]),  # a lens moves along and across
+                cost,
                 start,
                 method="Nelder-Mead",
                 bounds=_STD_BOUNDS,
