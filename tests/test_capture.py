@@ -215,7 +215,8 @@ def test_low_signal_has_the_exact_phase_density_and_no_other_bias(s, signal_e, v
     frames = capture(image, sensor, rng=np.random.default_rng(8), n_frames=n)
     psi = wrapped(frames.range_m.ravel() - 5.0, sensor) / sensor.metres_per_radian
     edges = np.linspace(-np.pi, np.pi, bins + 1)
-    expected = np.array([integrate.quad(phase_density, a, b, args=(s,))[0] for a, b in itertools.pairwise(edges)])
+    pieces = itertools.pairwise(edges)
+    expected = np.array([integrate.quad(lambda x: float(phase_density(x, s)), a, b)[0] for a, b in pieces])
     psi = psi[np.isfinite(psi)]  # a phasor of 0 has no range
     counts, _ = np.histogram(psi, edges)
     keep = expected * n > 5  # χ² needs a few counts in a bin

@@ -321,7 +321,7 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
     assert [search.cells_of(k) for k in range(3)] == [cells[k] for k in frame]
     found = search.starts(evidence.seen[frame], np.full(3, 300.0))
     for k, own in enumerate(frame):
-        alone = method._search.before(cells[own]).starts(evidence.seen[[own]], np.full(1, 300.0))
+        alone = method._search.before(cells[own]).starts(evidence.seen[np.array([own])], np.full(1, 300.0))
         np.testing.assert_array_equal(found.view[found.frame == k], alone.view)
 
 
