@@ -34,11 +34,6 @@ from phasemark.inputs import verify_checksum
 FORMAT = "phasemark-part"
 SCHEMA_VERSION = 1
 
-_TRIAL_ITEMS = 64
-_TRIED_WHOLE = 200_000
-"""Most images or views of a plan whose time is estimated on the plan itself; of larger ones a sample is tried."""
-_TRIED_VIEWS = 4096
-_TRIED_VALUES = 64
 _GOLDEN = (5**0.5 - 1) / 2
 
 
@@ -340,14 +335,17 @@ def estimate_build(
     """
     planned = planned_size(plan)
     total = planned["images" if isinstance(plan, BankPlan) else "views"]
-    tried = _thinned(plan) if total > _TRIED_WHOLE else plan
+    # most images or views of a plan whose time is estimated on the plan itself; of larger ones a sample is tried
+    tried_whole = 200_000
+    tried = _thinned(plan) if total > tried_whole else plan
     job = job_for(tried)
     layout, _ = job.lay_out()
     header_bytes = layout.size - planned_size(tried)["bytes"]
     scale = total / sum(job.items)
     total = sum(job.items)
     make_shard(job, 0, 1)  # compiled code is loaded
-    count = min(_TRIAL_ITEMS, total)
+    trial_items = 64
+    count = min(trial_items, total)
     step = max(1, total // count)
     begun = time.perf_counter()
     run = 8 if trial_seconds is None else 1
@@ -367,11 +365,13 @@ def estimate_build(
 def _thinned(plan: BankPlan | FramePlan) -> BankPlan | FramePlan:
     """Return a plan whose images or views are a sample of those of a large plan, and take as long each."""
     if isinstance(plan, FramePlan):
-        return plan.model_copy(update={"views": _TRIED_VIEWS})
+        tried_views = 4096
+        return plan.model_copy(update={"views": tried_views})
     plan = plan.resolve()
     assert plan.delta_deg is not None
+    tried_values = 64
     fewer = {
-        name: values[:: math.ceil(len(values) / _TRIED_VALUES)]
+        name: values[:: math.ceil(len(values) / tried_values)]
         for name, values in (("distance_m", plan.distance_m), ("delta_deg", plan.delta_deg))
     }
     return plan.model_copy(update=fewer)

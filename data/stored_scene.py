@@ -22,9 +22,6 @@ from phasemark.data.files.hdf5_reading import (
 from phasemark.data.plans.bank_plan import ScenePlan
 from phasemark.render import Sensor
 
-_FARTHEST_VERTEX_M = 1e3
-"""No landmark is so large; damage that leaves a number often is."""
-
 
 class StoredScene:
     """A bank or a frame set that is open for reading; a context manager.
@@ -116,7 +113,8 @@ class StoredScene:
             )
         if not (vertices.ndim == faces.ndim == 2 and vertices.shape[1:] == faces.shape[1:] == (3,) and faces.size):
             raise InputFileError(f"{path}: '{where}' must hold rows of three, of vertices and faces")
-        if not (np.abs(vertices) <= _FARTHEST_VERTEX_M).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        farthest_vertex_m = 1e3  # no landmark is so large; damage that leaves a number often is
+        if not (np.abs(vertices) <= farthest_vertex_m).all() or faces.min() < 0 or faces.max() >= len(vertices):
             raise InputFileError(f"{path}: '{where}' has vertices that are not within 1 km, or not there")
         if part is not None and (part.shape != faces.shape[:1] or part.min() < 0 or part.max() > 1):
             raise InputFileError(f"{path}: '{where}/part' must have one value for each face, 0 or 1")

@@ -29,8 +29,6 @@ TOLERANCE_M = 1e-5
 """Embree and the C library differ by instruction set; ranges made elsewhere agree to this."""
 TOLERANCE = 1e-5
 """The same for phasors, intensities and coverages, of the brightest pixel."""
-_NOISY_SHARE = 0.01
-"""Share of a view's noisy pixels that may differ: where rounding decides about a photon or a threshold."""
 _BLOCK_BYTES = 1 << 24
 _MAY_BE_NAN = ("wall", "floor", "target_distance", "target_sigma")
 _NOISY = ("range", "amplitude", "intensity", "taps", "range_shot", *HISTOGRAM_FIELDS)
@@ -161,11 +159,13 @@ def _close(one: NDArray[Any], other: NDArray[Any]) -> NDArray[np.bool_]:
 def _compare(
     path: Path, item: int, job: SceneJob[Any], stored: dict[str, NDArray[Any]], made: dict[str, NDArray[Any]]
 ) -> None:
+    # share of a view's noisy pixels that may differ: where rounding decides about a photon or a threshold
+    noisy_share = 0.01
     for name, old in stored.items():
         new = made[name].reshape(old.shape)
         if name == "flags":
             share = float(np.mean(old != new))
-            if share > _NOISY_SHARE:
+            if share > noisy_share:
                 raise InputFileError(
                     f"{path}: 'flags' of view {item} differ in {share:.1%} of the pixels when made again"
                 )
@@ -179,7 +179,7 @@ def _compare(
             limit = TOLERANCE * float(np.nanmax(np.abs(old), initial=1e-30))
         wrong = nan_differs | (np.abs(gap) > limit)
         noisy = name in _NOISY
-        if float(np.mean(wrong)) > (_NOISY_SHARE if noisy else 0.0):
+        if float(np.mean(wrong)) > (noisy_share if noisy else 0.0):
             place = np.unravel_index(int(np.argmax(np.abs(gap) + nan_differs)), gap.shape)
             raise InputFileError(
                 f"{path}: '{name}' of item {item} is not what rendering it again gives: {old[place]} at"

@@ -16,8 +16,6 @@ from phasemark import InputFileError
 _BLOCK_BYTES = 1 << 20
 _MOST_BYTES = 1 << 14
 """A checksum file is one line: a digest and the name of a file."""
-_ATTEMPTS = 3
-"""How often file and checksum are compared while somebody replaces both."""
 _CHECKSUM_LINE = re.compile(r"\\?(?P<digest>[0-9a-fA-F]{64}) [ *](?P<name>[^\n]+)\n?")
 
 _verifying: ContextVar[bool] = ContextVar("verifying", default=True)
@@ -161,7 +159,8 @@ def is_vouched_for(path: Path, content: bytes | BinaryIO | None = None) -> bool:
     path = _with_checksum(path)
     if not verifying() or not os.path.lexists(checksum_path(path)):
         return False
-    for attempt in range(_ATTEMPTS):
+    attempts = 3  # how often file and checksum are compared while somebody replaces both
+    for attempt in range(attempts):
         try:
             stated = read_checksum(path)
         except InputFileError:

@@ -6,7 +6,6 @@ from phasemark import UsageError
 from phasemark.landmarks.spec import Box, Cone, Cylinder, LandmarkSpec, Sphere
 
 _BOX = Box(length_m=0.24, width_m=0.16, height_m=0.15)
-_HEIGHT_M = 0.15
 
 
 class _Catalog(dict[str, LandmarkSpec]):
@@ -34,10 +33,11 @@ def catalog() -> dict[str, LandmarkSpec]:
     >>> list(catalog())
     ['cylinder', 'cone', 'sphere', 'post']
     """
+    height_m = 0.15
     uppers: dict[str, Cylinder | Cone | Sphere] = {
-        "cylinder": Cylinder(radius_m=0.06, height_m=_HEIGHT_M),
-        "cone": Cone(radius_m=0.075, height_m=_HEIGHT_M),
-        "sphere": Sphere(radius_m=_HEIGHT_M / 2),
-        "post": Cylinder(radius_m=0.035, height_m=_HEIGHT_M),
+        "cylinder": Cylinder(radius_m=0.06, height_m=height_m),
+        "cone": Cone(radius_m=0.075, height_m=height_m),
+        "sphere": Sphere(radius_m=height_m / 2),
+        "post": Cylinder(radius_m=0.035, height_m=height_m),
     }
     return _Catalog({name: LandmarkSpec(name=name, box=_BOX, upper=upper) for name, upper in uppers.items()})

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 _CREASE_RAD = np.radians(30)
 _COLOUR = np.array([0.47, 0.65, 0.85])
-_SIDE_IN = 5.2
 _FIRST_COLOUR = "#b3261e"  # of the line of sight at δ = 0
 
 
@@ -43,7 +42,8 @@ def mesh_figure(
     bytes
         A PNG.
     """
-    figure = Figure(figsize=(_SIDE_IN * (1 + directions), _SIDE_IN))
+    side_in = 5.2
+    figure = Figure(figsize=(side_in * (1 + directions), side_in))
     share = 1 / (1 + directions)
     axes = Axes3D(figure, (0.0, 0.03, 0.92 * share, 0.94), computed_zorder=False)
     figure.add_axes(axes)

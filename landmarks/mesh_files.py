@@ -26,9 +26,6 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 _MOST_BYTES = 1 << 27
 """What MAX_FACES take in binary, with a margin; in text it is half as many faces, which no landmark needs either."""
-_MOST_AT_VERTEX = 4096
-"""Faces that may meet at one vertex: where polygons of more corners are cut into triangles, all of them lie in the way
-of each other, and finding what is near a point takes the square of their number."""
 FORMATS = ("stl", "ply", "obj", "off")
 METRES_PER_UNIT = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
 ORIGINS = ("file", "base", "center")
@@ -281,9 +278,12 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
     if not len(faces):
         raise InputFileError(f"{name}: has no extent: no face has an area")
     meeting = int(np.bincount(faces.ravel()).max())
-    if meeting > _MOST_AT_VERTEX:
+    # faces that may meet at one vertex: where polygons of more corners are cut into triangles, all of them lie in the
+    # way of each other, and finding what is near a point takes the square of their number
+    most_at_vertex = 4096
+    if meeting > most_at_vertex:
         raise InputFileError(
-            f"{name}: {meeting} faces meet at one vertex, at most {_MOST_AT_VERTEX} can be used: give a polygon fewer"
+            f"{name}: {meeting} faces meet at one vertex, at most {most_at_vertex} can be used: give a polygon fewer"
             " corners"
         )
     used, faces = np.unique(faces, return_inverse=True)

@@ -16,15 +16,10 @@ from phasemark import UsageError
 MAX_SYMMETRY = 360
 """Largest symmetry of a plan; a body of revolution has it too: no side of it can be told from another."""
 
-_TOLERANCE_M = 0.5e-3  # a match tells positions to some 0.2 to 0.5 mm at 1 m: what differs by less looks the same
-_TOLERANCE_SHARE = 0.01  # of the largest extent: 0.5 mm is no small part of a mesh below 5 cm
-_AREA_SAMPLES = 4096
 _MOST_POINTS = 20_000
 _FIRST_POINTS = 64  # most turns are refused by these
-_POINTS_AT_ONCE = 8192
 _FACES_OF_LEAF = 4
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
-_PLASTIC = 1.32471795724474602596  # of the R2 sequence (Roberts 2018), which fills a square evenly
 
 _Float = NDArray[np.float64]
 
@@ -39,7 +34,9 @@ def symmetry_tolerance_m(mesh: trimesh.Trimesh) -> float:
     mesh : trimesh.Trimesh
         Metres.
     """
-    return min(_TOLERANCE_M, _TOLERANCE_SHARE * float(max(mesh.extents)))
+    tolerance_m = 0.5e-3  # a match tells positions to some 0.2 to 0.5 mm at 1 m: what differs by less looks the same
+    tolerance_share = 0.01  # of the largest extent: 0.5 mm is no small part of a mesh below 5 cm
+    return min(tolerance_m, tolerance_share * float(max(mesh.extents)))
 
 
 def mesh_symmetry(mesh: trimesh.Trimesh) -> int:
@@ -138,15 +135,18 @@ class _Surface:
         """Return points spread evenly over the area, (n, 3)."""
         a, b, c = (self.triangles[:, k] for k in range(3))
         area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        number = np.arange(_AREA_SAMPLES)
-        face = np.searchsorted(np.cumsum(area), (number + 0.5) / _AREA_SAMPLES * area.sum()).clip(max=len(area) - 1)
-        u, v = (number / _PLASTIC) % 1, (number / _PLASTIC**2) % 1
+        area_samples = 4096
+        number = np.arange(area_samples)
+        face = np.searchsorted(np.cumsum(area), (number + 0.5) / area_samples * area.sum()).clip(max=len(area) - 1)
+        plastic = 1.32471795724474602596  # of the R2 sequence (Roberts 2018), which fills a square evenly
+        u, v = (number / plastic) % 1, (number / plastic**2) % 1
         u, v = np.where(u + v > 1, 1 - u, u)[:, None], np.where(u + v > 1, 1 - v, v)[:, None]
         return np.asarray(a[face] + u * (b - a)[face] + v * (c - a)[face])
 
     def _lies_on_itself(self, angle_rad: NDArray[np.floating[Any]]) -> bool:
         """Return True if every point, turned by its angle, lies on the surface; stop at the first that does not."""
         start, size = 0, _FIRST_POINTS
+        points_at_once = 8192
         while start < len(self.points):
             some = slice(start, start + size)
             cos, sin = np.cos(angle_rad[some]), np.sin(angle_rad[some])
@@ -154,7 +154,7 @@ class _Surface:
             turned = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
             if not self._near(turned):
                 return False
-            start, size = start + size, min(8 * size, _POINTS_AT_ONCE)
+            start, size = start + size, min(8 * size, points_at_once)
         return True
 
     def _near(self, points: _Float) -> bool:

@@ -44,8 +44,9 @@ class _OneFrequencyGroup(BankGroup):
             return self._one.stack(np.stack([self._group.at_frequency(own) for own in hz], axis=-3))
         by_hz = {own: self._group.at_frequency(own).reshape(-1, *self._group.phasor.shape[-2:]) for own in hz}
         out = np.empty(by_hz[hz[0]].shape, np.complex64)
-        for start in range(0, len(out), _IMAGES_AT_ONCE):
-            part = slice(start, start + _IMAGES_AT_ONCE)
+        images_at_once = 4096
+        for start in range(0, len(out), images_at_once):
+            part = slice(start, start + images_at_once)
             own = {f: values[part].astype(np.complex128) for f, values in by_hz.items()}
             nothing = np.zeros(own[hz[0]].shape)
             views = Views.broadcast(np.ones(len(nothing)))
@@ -55,7 +56,6 @@ class _OneFrequencyGroup(BankGroup):
 
 
 _IMAGES = ("phasor", "intensity", "coverage")
-_IMAGES_AT_ONCE = 4096
 
 
 class OneFrequencyBank(Bank):

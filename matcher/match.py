@@ -211,7 +211,6 @@ def scale_of_degrees(name: str) -> float:
     return math.degrees(1.0) if name.endswith("_rad") else 1.0
 
 
-_MOST_SHOWN = 100
 _COLUMNS = ("class", "D (m)", "δ (°)", "accepted", "p")
 
 
@@ -351,6 +350,7 @@ class Matches(Sequence[Match]):
 
     def _repr_html_(self) -> str:
         """Show the matches in a notebook, the first hundred of them."""
-        caption = f"{len(self)} matches" + (f", the first {_MOST_SHOWN}" if len(self) > _MOST_SHOWN else "")
-        rows = [(k, *_cells(match)) for k, match in enumerate(self[:_MOST_SHOWN])]
+        most_shown = 100
+        caption = f"{len(self)} matches" + (f", the first {most_shown}" if len(self) > most_shown else "")
+        rows = [(k, *_cells(match)) for k, match in enumerate(self[:most_shown])]
         return table_html(("position", *_COLUMNS), rows, caption=caption)

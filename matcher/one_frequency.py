@@ -26,9 +26,6 @@ from phasemark.render import PhasorImages, Renderer, Sensor, Views, unwrap_range
 from phasemark.render.sensor.frequencies import common_divisor_hz
 from phasemark.render.sensor.lens_fields import DERIVED
 
-_UNMIXED_RAD = 0.01
-"""How far the phases of the frequencies may disagree, as a standard deviation, for a pixel to count as unmixed."""
-
 Way = Literal["stacked", "combined"]
 
 
@@ -183,7 +180,9 @@ class OneFrequency:
         The unwrapped range of another may run away with the smallest move, and tells nothing of the view.
         """
         ranges = np.stack([part.range_m for part in seen.by_frequency])
-        return unwrap_ranges(ranges, _UNMIXED_RAD * self._metres[:, None, None, None], self.camera).consistent
+        # how far the phases of the frequencies may disagree, as a standard deviation, for a pixel to count as unmixed
+        unmixed_rad = 0.01
+        return unwrap_ranges(ranges, unmixed_rad * self._metres[:, None, None, None], self.camera).consistent
 
     def _combined_phasor(self, seen: PhasorImages) -> NDArray[np.complex128]:
         range_m = seen.range_m

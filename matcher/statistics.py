@@ -26,7 +26,6 @@ Law = Literal["student", "normal"]
 """How an interval is made; see the table above."""
 
 _LEVEL = 0.95
-_Z95 = 1.96
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,8 @@ def rms_interval(values: ArrayLike, *, law: Law = "student") -> Interval:
 
 
 def _quantile(n: int, law: Law) -> float:
-    return _Z95 if law == "normal" else float(special.stdtrit(n - 1, (1 + _LEVEL) / 2))
+    z95 = 1.96
+    return z95 if law == "normal" else float(special.stdtrit(n - 1, (1 + _LEVEL) / 2))
 
 
 def ratio_interval(above: Interval, below: Interval) -> Interval:

@@ -42,11 +42,7 @@ RANGE_COLOURS = (
 
 SIGMA_SPAN = 5.0
 """Where the colours of a residual in σ end, to both sides."""
-_LANDMARK_COVERAGE = 0.5
 _LANDMARK_PERCENTILES = (2, 98)
-_LEAST_SPAN_M = 0.02
-_OWN_REACH = 0.5
-"""How far beyond the percentiles a range is still the landmark's own where nothing stands beside it; of their span."""
 _LANDMARK_DEPTH_M = 0.4
 """How far behind the nearest surface a measured frame's landmark is taken to reach, as in estimating backgrounds."""
 
@@ -62,8 +58,6 @@ _FLAG_COLOURS = {
     "dead": "#202020",
 }
 
-_GRID_LINES = 32
-"""Borders of pixels that are drawn along each side of an image, about."""
 _GRID_STYLE: dict[str, Any] = {"color": "#2f6fe4", "linewidth": 0.7}
 
 
@@ -79,7 +73,8 @@ def pixel_grid_figure(sensor: Sensor) -> Figure:
     matplotlib.figure.Figure
         With many pixels only every n-th border is drawn; the title states n.
     """
-    step = max(1, math.ceil(max(sensor.rows, sensor.cols) / _GRID_LINES))
+    grid_lines = 32  # borders of pixels that are drawn along each side of an image, about
+    step = max(1, math.ceil(max(sensor.rows, sensor.cols) / grid_lines))
     figure = Figure(figsize=(7.0, 7.0 * min(1.4, max(0.6, sensor.rows / sensor.cols))), layout="constrained")
     axes = figure.add_subplot()
     along_u, along_v = np.linspace(0.0, sensor.cols, 201), np.linspace(0.0, sensor.rows, 201)
@@ -177,15 +172,20 @@ def landmark_limits_m(
         for ranges more than half that span outside, which are noise.
     """
     returned = np.isfinite(range_m)
-    seen = range_m[returned & (coverage >= _LANDMARK_COVERAGE)]
+    landmark_coverage = 0.5
+    seen = range_m[returned & (coverage >= landmark_coverage)]
     if not seen.size:
         return None, None
     near, far = (float(one) for one in np.percentile(seen, _LANDMARK_PERCENTILES))
     if not (returned & (coverage == 0.0)).any():
-        reach = _OWN_REACH * (far - near)
+        # how far beyond the percentiles a range is still the landmark's own where nothing stands beside it; of their
+        # span
+        own_reach = 0.5
+        reach = own_reach * (far - near)
         own = range_m[returned & (range_m >= near - reach) & (range_m <= far + reach)]
         near, far = float(own.min()), float(own.max())
-    widen = max(0.0, _LEAST_SPAN_M - (far - near)) / 2
+    least_span_m = 0.02
+    widen = max(0.0, least_span_m - (far - near)) / 2
     return near - widen, far + widen
 
 
@@ -430,13 +430,10 @@ def _draw_flags(axes: Axes, flags: NDArray[np.uint8]) -> None:
     _legend_below(axes, [Patch(facecolor=_FLAG_COLOURS[name], edgecolor="0.5", label=name) for name in present])
 
 
-_LABEL_POINTS = 36.0
-"""Room below an image for ticks and the label of its axis."""
-
-
 def _legend_below(axes: Axes, handles: list[Patch]) -> None:
     """Put a legend below the label of the axis, whatever the image's shape."""
-    below = offset_copy(axes.transAxes, fig=axes.get_figure(root=True), y=-_LABEL_POINTS, units="points")
+    label_points = 36.0  # room below an image for ticks and the label of its axis
+    below = offset_copy(axes.transAxes, fig=axes.get_figure(root=True), y=-label_points, units="points")
     axes.legend(
         handles=handles, loc="upper center", bbox_to_anchor=(0.5, 0.0), bbox_transform=below, ncols=len(handles),
         frameon=False, fontsize="small", borderaxespad=0.0,

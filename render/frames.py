@@ -17,8 +17,6 @@ from phasemark.render.sensor.sensor import Sensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_TAPS_PER_PHASE_IMAGE = 2
-
 
 class Flag(IntFlag):
     """Reasons why a pixel's range is not valid; 0 where it is valid."""
@@ -152,7 +150,8 @@ class Frames:
         self.taps_e: NDArray[np.float64] | None = None
         if taps_e is not None:
             taps = real_array("taps_e", taps_e)
-            of_pixel = (sensor.n_phase_images, _TAPS_PER_PHASE_IMAGE)
+            taps_per_phase_image = 2
+            of_pixel = (sensor.n_phase_images, taps_per_phase_image)
             expected = (*given.shape[:-2], *of_pixel, *given.shape[-2:])
             if taps.shape != expected:
                 raise UsageError(f"'taps_e' has shape {taps.shape}, but must have {expected}")

@@ -25,10 +25,6 @@ Profile = Sequence[tuple[float, float]] | Callable[[NDArray[np.float64]], NDArra
 # Corners of a box of unit length and width, in order round it.
 _CORNERS = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 
-# A line that passes a corner by less than this share of the corner's distance goes through it: far below anything that
-# shows in an image, far above rounding.
-_TOUCHES = 1e-12
-
 
 @dataclass(frozen=True)
 class PlanarLandmark:
@@ -242,7 +238,10 @@ def _meet_box(
     rotation, translation = views.landmark2cam()
     corners = (_CORNERS * sides_m) @ rotation[:, :2, :2].swapaxes(1, 2) + translation[:, None, :2]  # (n, 4, 2)
     offset = _cross(corners[:, :, None], lines)  # (n, 4, cols)
-    offset[np.abs(offset) <= _TOUCHES * np.linalg.norm(corners, axis=-1)[..., None]] = 0.0
+    # A line that passes a corner by less than this share of the corner's distance goes through it: far below anything
+    # that shows in an image, far above rounding.
+    touches = 1e-12
+    offset[np.abs(offset) <= touches * np.linalg.norm(corners, axis=-1)[..., None]] = 0.0
     next_corners, next_offset = np.roll(corners, -1, axis=1), np.roll(offset, -1, axis=1)
     across = offset - next_offset  # the side's length times the sine of its angle with the line
     crossed = (offset * next_offset <= 0) & (across != 0)

@@ -46,12 +46,8 @@ _RETURNS = 1 << 9
 _BORDERS = 1 << 14
 _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
-_VIEWS_PER_TASK = 64
-_MAX_SPLITS = 4
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
-_SLOW_HZ = 10e6
-"""Frequency up to which the phase of a floor turns so little within a pixel that none is cut."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
 
@@ -200,8 +196,9 @@ class Renderer:
             )
         if not 0 < albedo <= 1:
             raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
-        if splits != int(splits) or not 1 <= splits <= _MAX_SPLITS:
-            raise UsageError(f"'splits' must be a whole number from 1 to {_MAX_SPLITS}, got {splits!r}")
+        max_splits = 4
+        if splits != int(splits) or not 1 <= splits <= max_splits:
+            raise UsageError(f"'splits' must be a whole number from 1 to {max_splits}, got {splits!r}")
         harmonics = sensor.harmonic_orders if harmonics is None else harmonics
         if any(order < 2 or order != int(order) for order in harmonics):
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
@@ -532,7 +529,8 @@ class Renderer:
             self.sensor.vignetting,
             _fastest(self.sensor),
         )
-        tasks = [slice(i, min(i + _VIEWS_PER_TASK, len(views))) for i in range(0, len(views), _VIEWS_PER_TASK)]
+        views_per_task = 64
+        tasks = [slice(i, min(i + views_per_task, len(views))) for i in range(0, len(views), views_per_task)]
         if workers == 1 or len(tasks) <= 1:
             run(tasks, ordered, behind, camera, light, sums)
         else:
@@ -665,7 +663,8 @@ class Renderer:
 def _fastest(sensor: Sensor) -> float:
     """Return the radians per metre of the highest modulation frequency, 0 of a single slow one behind an ideal lens."""
     highest = max(sensor.frequencies_hz)
-    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= _SLOW_HZ:
+    slow_hz = 10e6  # frequency up to which the phase of a floor turns so little within a pixel that none is cut
+    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= slow_hz:
         return 0.0
     return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
@@ -700,7 +699,6 @@ def background_image(background: Background, sensor: Sensor) -> PhasorImages:
 _COUNTING = Lock()
 """Threads may share a renderer, and its count; the lock is no part of it, so that it can be copied and pickled."""
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
-_MOST_TOPOLOGIES = 16
 
 
 def _topology(mesh: SurfaceMesh) -> MeshTopology:
@@ -720,7 +718,8 @@ def _topology(mesh: SurfaceMesh) -> MeshTopology:
             raise UsageError(f"a face of the mesh names vertex {wrong[0]}, but there are {n}, counted from 0")
         found = MeshTopology.from_mesh(unite_shells(mesh))
         _TOPOLOGIES[key] = found
-        if len(_TOPOLOGIES) > _MOST_TOPOLOGIES:
+        most_topologies = 16
+        if len(_TOPOLOGIES) > most_topologies:
             _TOPOLOGIES.popitem(last=False)
     return found
 

@@ -14,9 +14,6 @@ from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.unwrapping import Unwrapped, unwrap_ranges
 
-_USUAL_PHASE_STD_RAD = 0.1
-"""Phase noise of frames without amplitudes, where the sensor allows no less."""
-
 
 def unwrap_frames(parts: Sequence[Frames], sensor: Sensor, *, taps_e: NDArray[np.float64] | None = None) -> Frames:
     """Return the frames of a camera of several frequencies from those that each frequency measured.
@@ -111,7 +108,8 @@ def _one_frame_std_m(frames: Frames) -> NDArray[np.float64]:
     """Return the noise of one frame's range, metres."""
     sensor = frames.sensor
     if frames.amplitude_e is None or frames.intensity_e is None:
-        return np.array((sensor.max_phase_std_rad or _USUAL_PHASE_STD_RAD) * sensor.metres_per_radian)
+        usual_phase_std_rad = 0.1  # phase noise of frames without amplitudes, where the sensor allows no less
+        return np.array((sensor.max_phase_std_rad or usual_phase_std_rad) * sensor.metres_per_radian)
     return measured_range_std(frames.amplitude_e, frames.intensity_e, sensor)
 
 

@@ -22,9 +22,6 @@ from phasemark.render.sensor.sensor import Sensor
 INCONSISTENT_SHARE = 1e-4
 """Share of pixels that see one range and count as inconsistent all the same: by noise their frequencies disagree."""
 
-_LEAST_STD_RAD = 1e-6
-"""No phase counts as better known than this: a simulated one without noise has rounding."""
-
 
 class Unwrapped(NamedTuple):
     """Unwrapped range of several frequencies, with its quality; arrays (...).
@@ -97,7 +94,8 @@ def unwrap_ranges(range_m: ArrayLike, std_m: ArrayLike, sensor: Sensor) -> Unwra
     if (std < 0).any():
         raise UsageError(f"'std_m' must not be negative, got {std[std < 0][0]:g}")
     scale = np.array([camera.metres_per_radian for camera in sensor.by_frequency])
-    floored = np.maximum(std.reshape(m, -1), _LEAST_STD_RAD * scale[:, None])
+    least_std_rad = 1e-6  # no phase counts as better known than this: a simulated one without noise has rounding
+    floored = np.maximum(std.reshape(m, -1), least_std_rad * scale[:, None])
     n = floored.shape[1]
     best, first, second = np.full(n, np.nan), np.full(n, np.nan), np.full(n, np.nan)
     periods, multiples = _periods(sensor)

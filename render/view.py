@@ -25,8 +25,6 @@ _SHOWN = (
     ("distance_m", "D", " m"), ("delta_rad", "δ", "°"), ("bearing_rad", "bearing", "°"), ("height_m", "height", " m"),
     ("pitch_rad", "pitch", "°"), ("roll_rad", "roll", "°"),
 )  # fmt: skip
-_PLUMB = 1e-9
-"""A landmark's axis nearer to the optical axis than this (sine of an angle) leaves roll and bearing open."""
 
 
 def delta_period_rad(symmetry: int) -> float:
@@ -263,10 +261,12 @@ class Views:
         pose = rigid_transforms(landmark2cam)
         up = pose[:, :3, 2]  # Tᵀ · (0, 0, 1) = (−sin pitch, cos pitch · sin roll, cos pitch · cos roll)
         level = np.hypot(up[:, 1], up[:, 2])
-        if (level < _PLUMB).any():
+        # A landmark's axis nearer to the optical axis than this (sine of an angle) leaves roll and bearing open.
+        plumb = 1e-9
+        if (level < plumb).any():
             raise UsageError(
                 f"'landmark2cam' must not look straight up or down, where bearing and roll are one:"
-                f" matrix {int((level < _PLUMB).argmax())} does"
+                f" matrix {int((level < plumb).argmax())} does"
             )
         pitch, roll = np.arctan2(-up[:, 0], level), np.arctan2(up[:, 1], up[:, 2])
         tilt = tilt2level(pitch, roll)

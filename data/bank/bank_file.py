@@ -24,8 +24,6 @@ from phasemark.render import PhasorImages, Sensor, Views
 
 _IMAGES = ("_phasors", "intensity", "coverage")
 _PART_BYTES = 1 << 24
-_COVERAGE_SLACK = 0.01
-"""How far a coverage may lie outside 0 … 1: more than any error of the integral, less than damage."""
 
 
 class BankGroup:
@@ -160,7 +158,9 @@ class BankGroup:
     def coverage(self) -> NDArray[np.float32]:
         """Share of the pixel that sees the landmark, 0 … 1, (views, row, col)."""
         coverage = self._read("coverage")
-        outside = coverage[(coverage < -_COVERAGE_SLACK) | (coverage > 1 + _COVERAGE_SLACK)]
+        # how far a coverage may lie outside 0 … 1: more than any error of the integral, less than damage
+        coverage_slack = 0.01
+        outside = coverage[(coverage < -coverage_slack) | (coverage > 1 + coverage_slack)]
         if outside.size:
             raise InputFileError(f"{self._path}: '{self.name}/coverage' must be in 0 … 1, got {outside.flat[0]:g}")
         return frozen(coverage)

@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 NOTED_BYTES = 100_000_000
 """A file of at least this size is announced before it is built, with the time it takes."""
 
-_TRIAL_SECONDS = 2.0
-"""About how long that time is tried for."""
-
 
 def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out: Path, building: Building) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
@@ -97,7 +94,8 @@ def _note_large(
         refuse_too_many(plan)
         refuse_unwritable_output(out, force=building.force, resume=building.resume)
         threads = building.workers or processors()
-        seconds = estimate_build(plan, workers=threads, trial_seconds=_TRIAL_SECONDS)["seconds"] / parts
+        trial_seconds = 2.0  # about how long that time is tried for
+        seconds = estimate_build(plan, workers=threads, trial_seconds=trial_seconds)["seconds"] / parts
         tell(f"note: {described}; about {duration(seconds)} on {threads} processors here")
 
 

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 PROGRESS_SECONDS = 10.0
 """Time between two lines of progress where stderr is no terminal; work that takes less writes none."""
-_GAP = 2
-"""Spaces between two columns."""
 
 
 class LongWork:
@@ -160,12 +158,11 @@ class Table:
         self._widths = [
             max(width, *map(cell_len, column)) for width, column in zip(known, zip(*pieces, strict=True), strict=True)
         ]
-        full = sum(self._widths) + _GAP * len(self._widths)
+        gap = 2  # spaces between two columns
+        full = sum(self._widths) + gap * len(self._widths)
         console = Console(width=None if sys.stdout.isatty() else full, highlight=False)
         fits = full <= console.width
-        grid = Grid.grid(
-            *(Column(min_width=width if fits else None) for width in self._widths), padding=(0, _GAP, 0, 0)
-        )
+        grid = Grid.grid(*(Column(min_width=width if fits else None) for width in self._widths), padding=(0, gap, 0, 0))
         for piece in pieces:
             grid.add_row(*map(Text, piece))
         with console.capture() as printed:

@@ -46,9 +46,6 @@ if TYPE_CHECKING:
 
 ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"]
 
-_RECORDED_PIXELS = 5_000_000
-"""Most pixels of a simulated recording, all frames together: some hundred bytes of memory each."""
-
 
 def frames_build(
     plan_file: Path, *, out: Out, seed: Seed | None = None, views: Count | None = None, building: Building
@@ -241,8 +238,10 @@ def frames_simulate(
 
 def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
     """Refuse a recording that is too large to be made in memory."""
-    if n_frames * camera.rows * camera.cols > _RECORDED_PIXELS:
-        most = _RECORDED_PIXELS // (camera.rows * camera.cols)
+    # most pixels of a simulated recording, all frames together: some hundred bytes of memory each
+    recorded_pixels = 5_000_000
+    if n_frames * camera.rows * camera.cols > recorded_pixels:
+        most = recorded_pixels // (camera.rows * camera.cols)
         raise UsageError(
             f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
             " made in memory; phasemark frames build makes large sets"

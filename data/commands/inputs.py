@@ -194,10 +194,6 @@ def read_sensor_sources(name_or_file: str) -> dict[str, str]:
     return preset_sources(name_or_file) if name_or_file in preset_names() else read_sources(name_or_file)
 
 
-_PIXELS_OF_BOARDS = 64
-"""Zones of a frame that boards print unless they are set otherwise."""
-
-
 def sensor_of_board(frames: Path, board: str | None) -> str:
     """Return the preset of the sensor on the board that printed some frames, stated or recognised.
 
@@ -211,7 +207,8 @@ def sensor_of_board(frames: Path, board: str | None) -> str:
 
     with opened(frames, most_bytes=MOST_LOG_BYTES) as file:
         head = file.read(HEAD_BYTES)
-    found = find_board(board, head, _PIXELS_OF_BOARDS, frames)
+    pixels_of_boards = 64  # zones of a frame that boards print unless they are set otherwise
+    found = find_board(board, head, pixels_of_boards, frames)
     if found is None:
         raise UsageError(f"{frames} does not say which sensor took it: give --sensor NAME (phasemark sensor list)")
     return "tmf8828-8x8" if found.name == "tmf8828" else "vl53l5cx-8x8"

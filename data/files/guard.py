@@ -34,8 +34,6 @@ FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLE
 _MEMORY_BYTES = 1 << 30  # address space, most of it never touched: what a bare interpreter with NumPy maps
 _SECONDS = 3
 """Processor time for small files: what else the machine does is no fault of the file."""
-_PATIENCE = 10
-"""How many times that a child may take in all, before a disk or a pipe that does not answer is given up."""
 _BYTES_PER_SECOND = 1 << 26
 _BLOCK_BYTES = 1 << 22
 _SOFT, _EXTERNAL, _HARD = h5py.h5l.TYPE_SOFT, h5py.h5l.TYPE_EXTERNAL, h5py.h5l.TYPE_HARD
@@ -195,17 +193,19 @@ def first_reading(path: str | os.PathLike[str]) -> str | None:
         "PYTHONIOENCODING": "utf-8",
     }
     command = [sys.executable, "-P", os.path.abspath(__file__), os.path.abspath(path), str(seconds)]
+    # how many times that a child may take in all, before a disk or a pipe that does not answer is given up
+    patience = 10
     try:
         child = subprocess.run(
             command,
             env=environment,
             stdin=subprocess.DEVNULL,
             capture_output=True,
-            timeout=_PATIENCE * seconds,
+            timeout=patience * seconds,
             check=False,
         )
     except subprocess.TimeoutExpired:
-        return f"cannot be read within {_PATIENCE * seconds} s"
+        return f"cannot be read within {patience * seconds} s"
     if child.returncode == 0:
         return None
     if child.returncode == 3:

@@ -7,7 +7,6 @@ import errno
 import os
 from pathlib import Path
 
-_AT_FDCWD = -100
 _NO_REPLACE, _EXCHANGE = 1, 2  # linux/fs.h
 _UNKNOWN = {errno.EINVAL, errno.ENOSYS, errno.EXDEV}
 """What kernels and file systems answer that do not know a flag."""
@@ -55,7 +54,8 @@ def _renameat2(source: Path, target: Path, flags: int) -> bool:
     call = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None)
     if call is None:
         return False
-    if call(_AT_FDCWD, os.fsencode(source), _AT_FDCWD, os.fsencode(target), ctypes.c_uint(flags)) == 0:
+    at_fdcwd = -100
+    if call(at_fdcwd, os.fsencode(source), at_fdcwd, os.fsencode(target), ctypes.c_uint(flags)) == 0:
         return True
     code = ctypes.get_errno()
     if code in _UNKNOWN:

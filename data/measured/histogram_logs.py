@@ -29,7 +29,6 @@ from phasemark.render.direct.targets import Status, Targets
 _MOST_BYTES = 1 << 28
 _MOST_VALUES = 1 << 26
 _NAMES = ("histogram", "reference_histogram", "distance_m", "sensor2world", "t_ms", "t_s")
-_MOST_LISTED = 16
 _TARGET_COLUMN = re.compile(r"(mm|sigma_mm|signal|status)_([0-9]{1,9})_([0-9]{1,9})")
 """Column of a log of targets: quantity, zone and target."""
 
@@ -180,12 +179,13 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     header = [name.strip() for name in lines[0].split(",")]
     n_zones = sensor.rows * sensor.cols
     places: dict[tuple[str, int, int], int] = {}
+    most_listed = 16
     for column, name in enumerate(header):
         if match := _TARGET_COLUMN.fullmatch(name):
             kind, zone, target = match[1], int(match[2]), int(match[3])
-            if zone >= n_zones or target >= _MOST_LISTED:
+            if zone >= n_zones or target >= most_listed:
                 raise InputFileError(
-                    f"{path}: column '{name}' is beyond {n_zones} zones of at most {_MOST_LISTED} targets"
+                    f"{path}: column '{name}' is beyond {n_zones} zones of at most {most_listed} targets"
                 )
             places[kind, zone, target] = column
     if not any(kind == "mm" for kind, *_ in places):

@@ -50,16 +50,10 @@ _COLUMNS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps", *
 """Arrays of NPZ and HDF5 files that are read."""
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
-_BEYOND_MAX_RANGE = 1.25
-"""How far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little."""
 _MOST_BYTES = 1 << 26
 """What is read of a text file or a pipe: most of an hour of 16 × 16 readings, 15 a second."""
 _FREE_VALUES = 1 << 24
 """How many values frames may have whatever their file's size: 36 minutes of 16 × 16 pixels at 30 frames a second."""
-_VALUES_PER_BYTE = 2
-"""How many a file may hold for each of its bytes; what is packed more tightly than this was made to fill the memory."""
-_WORD_BYTES = 256
-"""Most that the words for unit and quantity take."""
 
 
 def read_frames(
@@ -228,7 +222,9 @@ def _frame_times_s(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArra
 def _range_limit(sensor: Sensor) -> tuple[float, str]:
     """Return the range below which all readings of a sensor lie, metres, and where the limit comes from."""
     if sensor.kind == "direct" and sensor.max_range_m is not None:
-        return _BEYOND_MAX_RANGE * sensor.max_range_m, f"{_BEYOND_MAX_RANGE:g} times the sensor's 'max_range_m'"
+        # how far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little
+        beyond_max_range = 1.25
+        return beyond_max_range * sensor.max_range_m, f"{beyond_max_range:g} times the sensor's 'max_range_m'"
     return sensor.unambiguous_range_m, "c / 2f"
 
 
@@ -453,7 +449,10 @@ class _Room:
 
     def __init__(self, path: Path, size: int) -> None:
         self._path = path
-        self._left = max(_FREE_VALUES, _VALUES_PER_BYTE * size)
+        # how many a file may hold for each of its bytes; what is packed more tightly than this was made to fill the
+        # memory
+        values_per_byte = 2
+        self._left = max(_FREE_VALUES, values_per_byte * size)
 
     def take(self, name: str, shape: tuple[int, ...] | None, dtype: np.dtype[Any]) -> None:
         """Refuse an array that is not of plain numbers, or holds more of them than is left."""
@@ -542,8 +541,9 @@ def _read_npz(file: BinaryIO, size: int, path: Path) -> Recording:
             with archive.zip.open(members[name]) as inner:
                 room.take(name, *_npy_header(inner))
         words = [name for name in ("unit", "quantity") if name in members]
+        word_bytes = 256  # most that the words for unit and quantity take
         for name in words:
-            if members[name].file_size > _WORD_BYTES + 128:
+            if members[name].file_size > word_bytes + 128:
                 raise InputFileError(f"{path}: '{name}' must be a word, got {members[name].file_size} bytes")
         if not {"range", "frequency_range"} & set(archive):
             if "histogram" in archive:

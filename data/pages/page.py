@@ -14,8 +14,6 @@ from markupsafe import Markup
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_DPI = 110
-
 
 def page_template(package: str, name: str) -> jinja2.Template:
     """Return a template of a package; it may extend ``base.html.j2``, which has the style, a title and a content block.
@@ -38,12 +36,13 @@ def page_template(package: str, name: str) -> jinja2.Template:
 def figure_png(figure: Figure) -> bytes:
     """Return a figure as PNG, 110 dots an inch; its layout is computed once, and stays."""
     engine = figure.get_layout_engine()
+    dpi = 110
     if engine is not None:
-        figure.set_dpi(_DPI)
+        figure.set_dpi(dpi)
         engine.execute(figure)
         figure.set_layout_engine(None)  # or saving computes it once more in vain
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_DPI)
+    figure.savefig(buffer, format="png", dpi=dpi)
     return buffer.getvalue()
 
 

@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 
 MAX_POINTS = 100_000
-_MOST_DIGITS = 18
 _DECIMALS = 12  # values are rounded to this, so that 0.7 + 1 · 0.01 is the number 0.71
-_ON_GRID = 1e-6  # STOP lies on the grid when it is this close, in steps
 
 
 def parse_grid(grid: str | float | Sequence[float], name: str = "grid") -> NDArray[np.float64]:
@@ -124,7 +122,8 @@ def as_count(text: str) -> int | None:
     """Return the number that decimal digits write, or None for other text; one beyond 10¹⁸ counts as 10¹⁸."""
     if not (text.isascii() and text.isdigit()):
         return None
-    return int(text) if len(text.lstrip("0")) <= _MOST_DIGITS else 10**_MOST_DIGITS
+    most_digits = 18
+    return int(text) if len(text.lstrip("0")) <= most_digits else 10**most_digits
 
 
 def drop_repeated_stop(delta_deg: NDArray[np.float64], period_deg: float) -> NDArray[np.float64]:
@@ -143,7 +142,8 @@ def _span(text: str, name: str) -> NDArray[np.float64]:
         raise UsageError(f"'{name}' must have a positive STEP, got {text!r}")
     if stop < start:
         raise UsageError(f"'{name}' must have a STOP that is not below START, got {text!r}")
-    steps = (stop - start) / step + _ON_GRID
+    on_grid = 1e-6  # STOP lies on the grid when it is this close, in steps
+    steps = (stop - start) / step + on_grid
     if steps >= MAX_POINTS:
         raise UsageError(f"'{name}' must have at most {MAX_POINTS} values, got {text!r}")
     return np.round(start + np.arange(math.floor(steps) + 1) * step, _DECIMALS)

@@ -29,8 +29,6 @@ MOST_VIEWS = 5_000_000
 MOST_FRAMES = 50_000_000
 """Of a frame set: their numbers are written at once, 16 bytes each."""
 _UNITS = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
-_BYTES_OF_A_FRAME = 24  # its number, its view and its seed
-_BYTES_OF_A_VIEW = 67  # its number, class, split and truth
 
 
 def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
@@ -128,7 +126,9 @@ def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
     counts = {
         "frame": plan.views * plan.frames_per_view, "view": plan.views, **dimension_sizes(sensor),
     }  # fmt: skip
-    size = _BYTES_OF_A_FRAME * counts["frame"] + _BYTES_OF_A_VIEW * counts["view"]
+    bytes_of_a_frame = 24  # its number, its view and its seed
+    bytes_of_a_view = 67  # its number, class, split and truth
+    size = bytes_of_a_frame * counts["frame"] + bytes_of_a_view * counts["view"]
     for name in frame_set_fields(plan, sensor):
         dims, kind, _, _ = FIELDS[name]
         size += math.prod(counts[dim] for dim in dims) * np.dtype(kind).itemsize

@@ -35,7 +35,6 @@ from phasemark.inputs import checksum_path, sha256_of
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""
 
-_COMMIT_SECONDS = 1.0
 _FORMAT = "phasemark-manifest"
 _SCHEMA_VERSION = 1
 
@@ -389,11 +388,12 @@ class _Run:
         unsafe: dict[int, str] = {}
         last = time.monotonic()
         n_threads = workers or (processors() if maker is None else maker.concurrency())
+        commit_seconds = 1.0
         try:
             for shard, digest in run_tasks(task, todo, n_threads, stop=None if maker is None else maker.close):
                 unsafe[shard] = digest
                 done += self._range(shard)[1] - self._range(shard)[0]
-                if time.monotonic() - last > _COMMIT_SECONDS:
+                if time.monotonic() - last > commit_seconds:
                     self._commit(unsafe)
                     last = time.monotonic()
                 if progress is not None:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from phasemark.matcher.likelihood.residuals import ResidualKind
     from phasemark.render.direct.histogram_images import HistogramRenderer
 
-_WALL_STEP_M = 1e-4
 _WEAK_SHARE = 1e-13  # of information in metres and radians
 NUISANCES = ("albedo", "wall_m", "wall_albedo")
 """What may be unknown beside the view: the landmark's albedo, the wall's distance and albedo."""
@@ -179,6 +178,7 @@ def cramer_rao(
     columns = [slope]
     if nuisances:
         alone = renderer.render_views(views, workers=workers).phasor if background else image.phasor
+        wall_step_m = 1e-4
         for name in nuisances:
             if name == "albedo":
                 columns.append(alone[:, None])
@@ -192,9 +192,9 @@ def cramer_rao(
                     renderer.render_views(
                         views, background=replace(background, wall_m=background.wall_m + step), workers=workers
                     ).phasor
-                    for step in (_WALL_STEP_M, -_WALL_STEP_M)
+                    for step in (wall_step_m, -wall_step_m)
                 ]
-                columns.append(((sides[0] - sides[1]) / (2 * _WALL_STEP_M))[:, None])
+                columns.append(((sides[0] - sides[1]) / (2 * wall_step_m))[:, None])
     mask = pixel_mask(pixels, sensor if one is None else one.camera)
     if one is not None:
         mask = one.same_for_all(mask)

@@ -33,8 +33,6 @@ from phasemark.render.sensor.range_noise import phase_image_variance
 N_FRAMES = 50
 """Frames that are averaged before matching (PHYSICS section 6)."""
 
-_BATCH = 256
-
 
 @dataclass(frozen=True)
 class SpacingLoss:
@@ -143,12 +141,13 @@ def grid_loss(bank: Bank, n: int, *, seed: int = 0, workers: int | None = None) 
     pixels = {"nearest": "lower" if bank.lower is not None else "all", "refined": "all"}
     parts: dict[str, list[Trials]] = {method: [] for method in methods}
     mismatches, information = [], []
+    batch = 256
     for k, (name, images_of) in enumerate(zip(bank.classes, job.whole_images(), strict=True)):
         mesh = bank.mesh(name)
         renderer = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"]))
         left = (n - k + len(bank.classes) - 1) // len(bank.classes)
         while left > 0:
-            some = min(left, _BATCH)
+            some = min(left, batch)
             left -= some
             views = Views.broadcast(
                 rng.uniform(bank.distance_m[0], bank.distance_m[-1], some),

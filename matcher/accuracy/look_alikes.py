@@ -14,7 +14,6 @@ from phasemark.render import Background, Renderer, Views
 
 _SHIFT_M = np.arange(-0.04, 0.041, 0.02)
 _TURN_RAD = np.radians(np.arange(0.0, 360.0, 10.0))
-_STARTS = 2
 _STEPS = 3
 _LONGEST_STEP = np.array([0.02, math.radians(8.0)])
 _PARAMETERS = ("distance_m", "delta_rad")
@@ -63,7 +62,8 @@ def _least_cost(
 ) -> NDArray[np.float64]:
     """Return the least cost of each true frame as another landmark, (n,)."""
     n = len(views)
-    place = np.empty((n, _STARTS, 2))
+    starts = 2
+    place = np.empty((n, starts, 2))
     for same in np.unique(np.stack([views.distance_m, views.bearing_rad, views.height_m]), axis=1).T:
         distance, bearing, height = same
         members = np.flatnonzero(
@@ -73,9 +73,9 @@ def _least_cost(
         grid = Views.broadcast(distance + shift, side, bearing, height)
         images = Appearance.of(other, grid, (), None, n_frames, background=background)
         for k in members:
-            best = np.argsort(truth.one(int(k)).imitated_by(images)[0])[:_STARTS]
+            best = np.argsort(truth.one(int(k)).imitated_by(images)[0])[:starts]
             place[k] = np.stack([grid.distance_m[best], grid.delta_rad[best]], axis=1)
-    whose = np.repeat(np.arange(n), _STARTS)
+    whose = np.repeat(np.arange(n), starts)
     at = place.reshape(-1, 2)
     seen = Appearance(
         truth.range_m[whose], truth.weight[whose], truth.slope[whose], truth.coverage[whose], truth.sensor
@@ -90,4 +90,4 @@ def _least_cost(
         if parameters:
             change = np.einsum("nij,nj->ni", np.linalg.pinv(information), gradient)
             at = at + np.clip(change, -_LONGEST_STEP, _LONGEST_STEP)
-    return np.asarray(least.reshape(n, _STARTS).min(axis=1))
+    return np.asarray(least.reshape(n, starts).min(axis=1))

@@ -27,9 +27,6 @@ from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Background, Sensor
 
-_USUAL_RENDERINGS = 400
-"""Of all poses: what a progress bar reckons with."""
-
 
 def calibrate(
     mesh: trimesh.Trimesh,
@@ -118,6 +115,7 @@ def calibrate(
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
     lit = quantity == "phasors" or background is not None or poses.wall_m is not None
+    usual_renderings = 400  # of all poses: what a progress bar reckons with
     problem = Problem(
         mesh,
         frames,
@@ -129,7 +127,7 @@ def calibrate(
         reports_z=sensor.quantity == "z" if reports_z is None else reports_z,
         zones=recorded and zones is not False and sensor.kind == "direct",
         workers=workers,
-        rendered=counter(progress, _USUAL_RENDERINGS),
+        rendered=counter(progress, usual_renderings),
         one=one,
     )
     solution = solve_recording(problem, moving=moving) if recorded else solve_still(problem, pose_std)

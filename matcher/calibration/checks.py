@@ -21,12 +21,6 @@ from phasemark.render.phasor_images import wrap_difference_m, wrap_range_m
 
 _UNKNOWN = 3.0
 """Standard deviation, in natural units (1°, 1 cm, 0.1), above which a parameter is not observable."""
-_SLACK_M = 0.05
-"""Depth to which a wall or floor may cut the landmark at the initial guess of the mounting, metres."""
-_FAR_RETURNS = 0.02
-"""Share of pixels that may return where the model has nothing, before something is taken to stand there."""
-_BESIDE_M = 0.3
-"""A return so much farther from the landmark's axis than its own size is something else."""
 _OUT_OF_VIEW_RAD = math.radians(5.0)
 _NEARBY_M, _FEWEST_NEARBY = 0.25, 0.1
 """Residuals from which a fit can start, and the share of pixels that must have them."""
@@ -66,7 +60,8 @@ def check_view(model: CalibrationModel, evidence: Evidence, assumed: Mounting) -
             f" the optical axis, and the image ends at {math.degrees(assumed.half_angle_h_rad):.1f}°; are heading and"
             " bearing in degrees, counter-clockwise?"
         )
-    model.check_behind(assumed.vector, _SLACK_M)
+    slack_m = 0.05  # depth to which a wall or floor may cut the landmark at the initial guess of the mounting, metres
+    model.check_behind(assumed.vector, slack_m)
     inside = np.flatnonzero(model.lens_within())
     if inside.size:
         k = int(inside[0])
@@ -123,12 +118,15 @@ def _unit_hint(ratio: float) -> str:
 def _elsewhere(model: CalibrationModel, evidence: Evidence) -> NDArray[np.bool_]:
     """Return which pixels have a range that is not near the landmark, (K, pixels)."""
     away = np.abs(wrap_difference_m(evidence.seen.range_m - model.poses.distance_m[:, None], evidence.sensor))
-    return np.asarray(away > model.reach_m + _BESIDE_M)
+    beside_m = 0.3  # A return so much farther from the landmark's axis than its own size is something else.
+    return np.asarray(away > model.reach_m + beside_m)
 
 
 def returns_beside(model: CalibrationModel, evidence: Evidence) -> bool:
     """Return True if many pixels see something behind the landmark although no background was given."""
-    return bool((evidence.seen.returned & _elsewhere(model, evidence)).mean() > _FAR_RETURNS)
+    # share of pixels that may return where the model has nothing, before something is taken to stand there
+    far_returns = 0.02
+    return bool((evidence.seen.returned & _elsewhere(model, evidence)).mean() > far_returns)
 
 
 def check_pixels(use: NDArray[np.bool_], poses: KnownPoses) -> None:

@@ -13,10 +13,6 @@ from phasemark.matcher.calibration.recording_fit import RecordingFit
 
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""
-_GREW = 1.02
-"""Factor by which held-out residuals may grow: what counting other pixels may do."""
-_MOST_LEFT_OUT = 0.5
-"""Share of the pixels on the landmark that may disagree with the model."""
 _DELAY_NOTED_S, _DELAY_GAIN = 0.015, 0.8
 """A stated delay is doubted if one farther away lowers the mean square residual to that share."""
 _BETTER = 0.5
@@ -40,9 +36,11 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
                 f" {one.text(assumed[k])}"
             )
     before, after = solution.held_out_m
-    if after > _GREW * before:
+    grew = 1.02  # factor by which held-out residuals may grow: what counting other pixels may do
+    if after > grew * before:
         doubts.append(f"the residuals of held-out frames grew from {1e3 * before:.3g} to {1e3 * after:.3g} mm (r.m.s.)")
-    if solution.left_out > _MOST_LEFT_OUT:
+    most_left_out = 0.5  # share of the pixels on the landmark that may disagree with the model
+    if solution.left_out > most_left_out:
         doubts.append(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
     if problem.track is not None and "delay" not in problem.names:
         fixed = RecordingFit(problem, edges=solution.edges)

@@ -28,7 +28,6 @@ COLUMNS = (
 """What a file of poses may have, in words."""
 POSE_UNITS = (("distance_mm", 1e3), ("delta_deg", math.degrees(1)), ("bearing_deg", math.degrees(1)))
 """How the errors of a pose are told."""
-_FARTHEST_M = 20.0
 _MOST_BYTES = 1 << 26
 """A pose is a line: this is half a million of them."""
 
@@ -225,11 +224,12 @@ def read_poses(
     values = {name: np.array(column) for name, column in columns.items()}
     x, y = landmark_xy_m
     distances = values["distance_m"] if is_polar else np.hypot(values["x_m"] - x, values["y_m"] - y)
+    farthest_m = 20.0
     for (where, _), distance, count in zip(table, distances, values.get("frames", np.ones(len(table))), strict=True):
-        if not 0 < distance < _FARTHEST_M:
+        if not 0 < distance < farthest_m:
             raise InputFileError(
                 f"{where}: the lens is {distance:g} m from the landmark, must be more than 0 and less than"
-                f" {_FARTHEST_M:g} m: the columns are in metres"
+                f" {farthest_m:g} m: the columns are in metres"
             )
         if count != int(count) or count < 1:
             raise InputFileError(f"{where}: 'frames' must be a number of frames, got {count:g}")

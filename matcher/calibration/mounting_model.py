@@ -43,8 +43,6 @@ _TERM_UNIT = math.tan(math.radians(1.0))
 """By how much, as a tangent, a natural unit of a term of the lens moves the image where it moves it most."""
 _POINTS = 9
 """Along each side of the image."""
-_LEAST_STRETCH = 0.01
-"""A lens that leaves a smaller share of its area to a part of the image is about to fold there: no step leads to it."""
 _HALVINGS = 12
 """How often a step that leads to no lens is halved before it is not taken."""
 _FULL = 1 - 1e-6
@@ -189,7 +187,10 @@ class CalibrationModel:
         whole = there[lens] - theta[lens]
         if self.sensor.lens is None or not whole.any():
             return there
-        least = min(_LEAST_STRETCH, stretch_of(self.sensor, theta))
+        # A lens that leaves a smaller share of its area to a part of the image is about to fold there: no step leads to
+        # it.
+        least_stretch = 0.01
+        least = min(least_stretch, stretch_of(self.sensor, theta))
         for halvings in range(_HALVINGS):
             if halvings:
                 there[lens] = theta[lens] + 0.5**halvings * whole

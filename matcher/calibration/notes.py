@@ -13,8 +13,6 @@ from phasemark.matcher.calibration.mounting import PARAMETERS, named
 from phasemark.render.integral.rounding import error_text
 from phasemark.render.sensor.lens_fields import TERMS
 
-_POORLY = 0.5
-"""Natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known."""
 _WELL = 0.05
 """And below which what it trades with does not matter: 3 arc minutes, half a millimetre."""
 _TRADES = 0.95
@@ -22,8 +20,6 @@ _TRADES = 0.95
 _ALIKE = 1.3
 """Largest over smallest distance, below which poses stand at one distance."""
 _BEARINGS_RAD = math.radians(3.0)
-_WRONG_POSE = 4.0
-"""χ² of a pose's residuals over the median of all poses, from which it is named."""
 _MOST_NAMED = 3
 _ALIKE_AT_ONE_DISTANCE = (("pitch", "height"), ("range_offset", "half_angle_h", "half_angle_v", "fx", "fy"))
 """What looks the same at one distance but for what landmark and light are known to be."""
@@ -69,7 +65,8 @@ def observability_notes(
     std = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(std, std)
     notes = []
-    poor = [name for name, s in zip(free, std / scale, strict=True) if s > _POORLY]
+    poorly = 0.5  # natural units (1°, 1 cm, 0.1): a standard deviation from which a number is called poorly known
+    poor = [name for name, s in zip(free, std / scale, strict=True) if s > poorly]
     pairs = [
         (free[i], free[j], float(correlation[i, j]))
         for i in range(len(free))
@@ -129,7 +126,8 @@ def misfit_notes(excess: float, p_value: float, poses: KnownPoses, chi2_share: N
         " background and units right, and are the poses as exact as stated?"
     ]
     told = chi2_share[chi2_share > 0]
-    limit = _WRONG_POSE * max(float(np.median(told)), 1.0) if told.size else math.inf
+    wrong_pose = 4.0  # χ² of a pose's residuals over the median of all poses, from which it is named
+    limit = wrong_pose * max(float(np.median(told)), 1.0) if told.size else math.inf
     odd = [int(k) for k in np.argsort(-chi2_share) if chi2_share[k] > limit]
     if odd and len(odd) <= len(poses) / 2:
         shown = "; ".join(f"{poses.where(k)} (χ² a residual: {chi2_share[k]:.3g})" for k in odd[:_MOST_NAMED])

@@ -16,9 +16,6 @@ from phasemark.matcher.filters.mean_phasor import phasor_mean
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Frames
 
-_FRAMES_FOR_SCATTER = 10
-"""Frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law."""
-
 
 def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:
     """Assign frames to each pose.
@@ -86,8 +83,10 @@ def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = 
     several = len(frames[0].sensor.frequencies_hz) > 1
     coherent = on == "phasors" or (on == "auto" and lit and frames[0].sensor.kind == "phase" and not several)
     parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
+    # frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law
+    frames_for_scatter = 10
     parts = [
-        _with_known_noise(part) if one.n_frames < _FRAMES_FOR_SCATTER else part
+        _with_known_noise(part) if one.n_frames < frames_for_scatter else part
         for part, one in zip(parts, frames, strict=True)
     ]
 

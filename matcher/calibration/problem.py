@@ -24,8 +24,6 @@ from phasemark.render import Background, Sensor
 
 FEWEST_POSES = 3
 """Minimum number of poses. Fewer suffice if fewer parameters are free."""
-_DELAY_REACH_S = 0.3
-"""Longest delay that is estimated, seconds: frames nearer to a gap between poses are left out."""
 _MOST_FRAMES = 800
 """Frames of a recording that enter; more are thinned evenly."""
 
@@ -115,7 +113,9 @@ class Problem:
         _, same, counts = np.unique(stamps, return_inverse=True, return_counts=True)
         unclear = (counts[same] > 1) | (stamps < np.maximum.accumulate(stamps))
         delay = self.assumed.delay_s
-        reach = max(_DELAY_REACH_S, abs(delay)) if "delay" in self.names else 0.0
+        # longest delay that is estimated, seconds: frames nearer to a gap between poses are left out
+        delay_reach_s = 0.3
+        reach = max(delay_reach_s, abs(delay)) if "delay" in self.names else 0.0
         known = track.known(stamps + delay - reach, stamps + delay + reach)
         index = np.flatnonzero(~unclear & known & (returns_of(frames) >= MIN_RETURNS))
         index = index[np.argsort(stamps[index], kind="stable")]

@@ -52,18 +52,9 @@ _GATE = 4.0
 """Standard deviations beyond which a pixel has no weight."""
 _SETTLED = 0.01
 """A step below this many standard deviations ends the iteration."""
-_NEEDED = 2.71
-"""−2 log likelihood that a size of errors must gain (5 %, one-sided), or it is taken to be zero."""
 _LEAST_NOISE_M = 1e-4
-_TERM_SHOWS = 6.63
-"""−2 log likelihood that a term of the noise law must gain (1 %)."""
-_MEDIAN_STD = 1.4826
-"""Standard deviation over median absolute deviation of normal errors."""
 FOLDS = 4
 """Parts into which blocks of time are dealt to be held out."""
-_FROM_PRIOR = 0.7
-"""Standard deviation over that of the prior, from which the data are said not to tell a number."""
-_DELAY_UNKNOWN_S = 0.05
 
 
 def solve_recording(problem: Problem, *, moving: bool) -> Solution:
@@ -81,13 +72,15 @@ def solve_recording(problem: Problem, *, moving: bool) -> Solution:
     solution = fit.solve(fit.approach())
     std = np.sqrt(np.diag(solution.covariance))
     delay_std = std[problem.names.index("delay")] if "delay" in problem.names else 0.0
-    if delay_std > _DELAY_UNKNOWN_S:
+    delay_unknown_s = 0.05
+    if delay_std > delay_unknown_s:
         raise UsageError(
             f"the delay cannot be determined from this recording (± {1e3 * delay_std:.0f} ms): turn and approach"
             " faster, or state it with Mounting(delay_s=…) and give fixed=delay"
         )
     prior = fit.prior * fit.scale
-    untold = [name for name, of_prior in zip(problem.names, std > _FROM_PRIOR * prior, strict=True) if of_prior]
+    from_prior = 0.7  # standard deviation over that of the prior, from which the data are said not to tell a number
+    untold = [name for name, of_prior in zip(problem.names, std > from_prior * prior, strict=True) if of_prior]
     return replace(solution, notes=(*notes, *sentences.untold_notes(untold), *solution.notes))
 
 
@@ -264,6 +257,7 @@ class RecordingFit:
         active = np.ones(len(log), bool)
         log, best = fitted(log, active)
         dropped = False
+        needed = 2.71  # −2 log likelihood that a size of errors must gain (5 %, one-sided), or it is taken to be zero
         while active[:own].any():
             without = []
             for i in np.flatnonzero(active[:own]):
@@ -271,7 +265,7 @@ class RecordingFit:
                 fewer[i] = False
                 without.append((cost(log, fewer), i))
             lowest, i = min(without)
-            if lowest - best >= _NEEDED:
+            if lowest - best >= needed:
                 break
             active[i], best, dropped = False, lowest, True
         if dropped:
@@ -287,6 +281,7 @@ class RecordingFit:
         square = residual[use] ** 2 / np.maximum(1 - leverage[use], 0.1)
         over_i = self.evidence.seen.range_m[use] ** 2 / 0.8
         best = (math.inf, old)
+        term_shows = 6.63  # −2 log likelihood that a term of the noise law must gain (1 %)
         for terms in ((0,), (0, 2), (0, 1), (0, 1, 2)):
             design = np.stack([over_i**power for power in terms], axis=1)
             variance = np.full(len(square), square.mean())
@@ -294,7 +289,7 @@ class RecordingFit:
             for _ in range(8):
                 found = optimize.nnls(design / variance[:, None], square / variance)[0]
                 variance = np.maximum(design @ found, _LEAST_NOISE_M**2)
-            cost = float((np.log(variance) + square / variance).sum()) + _TERM_SHOWS * len(terms)
+            cost = float((np.log(variance) + square / variance).sum()) + term_shows * len(terms)
             if cost < best[0]:
                 parts = dict(zip(terms, np.sqrt(found).tolist(), strict=True))
                 best = (cost, (parts[0], parts.get(1, 0.0), parts.get(2, 0.0)))
@@ -459,7 +454,8 @@ class RecordingFit:
 
 def _spread(residual: _Float) -> float:
     """Return the standard deviation that the median of absolute residuals means."""
-    return _MEDIAN_STD * float(np.median(np.abs(residual)))
+    median_std = 1.4826  # standard deviation over median absolute deviation of normal errors
+    return median_std * float(np.median(np.abs(residual)))
 
 
 def _total(std: _Float, pose: _Float, sizes: Sizes) -> _Float:

@@ -17,8 +17,6 @@ OUTLINE = (*_PLACES, *HALF_ANGLES, *TERMS)
 """What an outline tells."""
 _PLACE_STD, _OTHER_STD = 3.0, 0.7
 """Standard deviation of each about its initial guess, in natural units; the registration alone uses it."""
-_OUTLINE_NOISE = 0.2
-"""Of a pixel: how much of it the model says returns, against whether it did."""
 _RETURNS_FROM, _PREVAILS_FROM = 0.2, 0.6
 """Coverage that is enough for a return, and for one from the landmark if something stands behind; below, the chance of
 it is taken to rise evenly."""
@@ -26,9 +24,6 @@ _TRIED = (-3.0, -1.5, 0.0, 1.5, 3.0)
 """Pitches and bearings, degrees, from which the registration may start: a pixel apart."""
 _BESIDE = 0.02
 """Share of pixels with a return from elsewhere, above which something stands behind."""
-_OUTLINE_STEPS = 6
-_OUTLINE_WIDTH = 0.2
-"""Half width of its differences, natural units: a seventh of a pixel."""
 _NEARBY_M = 0.1
 """A return so much farther from the landmark than its own size is something else."""
 
@@ -68,17 +63,21 @@ def register(
     scale = model.scale[columns]
     prior = np.where(np.isin(free, _PLACES), _PLACE_STD, _OTHER_STD)
 
+    outline_noise = 0.2  # of a pixel: how much of it the model says returns, against whether it did
+
     def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
         returns = np.minimum(model.coverage(at) / enough, 1.0)
-        return np.asarray(np.where(known, target - returns, 0.0) / _OUTLINE_NOISE).ravel()
+        return np.asarray(np.where(known, target - returns, 0.0) / outline_noise).ravel()
 
     def cost(at: NDArray[np.float64]) -> float:
         away = (at - theta)[columns] / scale / prior
         return float((difference(at) ** 2).sum() + (away**2).sum())
 
+    outline_width = 0.2  # half width of its differences, natural units: a seventh of a pixel
+
     def slope(at: NDArray[np.float64], column: int) -> NDArray[np.float64]:
         unit = model.scale[column]
-        high, low, span = model.beside(at, column, unit * _OUTLINE_WIDTH)
+        high, low, span = model.beside(at, column, unit * outline_width)
         return np.asarray((difference(low) - difference(high)) / (span / unit))
 
     tried = [theta]
@@ -87,7 +86,8 @@ def register(
             own = columns_of([name])
             tried = [model.stepped(one, own, side * model.scale[own]) for one in tried for side in _TRIED]
     best = min(tried, key=cost)
-    for _ in range(_OUTLINE_STEPS):
+    outline_steps = 6
+    for _ in range(outline_steps):
         design = np.array([slope(best, column) for column in columns])
         away = (best - theta)[columns] / scale
         matrix = design @ design.T + np.diag(1 / prior**2)

@@ -49,12 +49,8 @@ _MAX_ITERATIONS, _FOLLOWED = 40, 8
 """How often slopes are taken, and how many steps are tried with each."""
 _SETTLED = 1e-3
 """A step that promises to lower χ² by less than this is not taken; where χ² is more than expected, by as much more."""
-_SEARCHED = 3
-"""Directions, of those that the poses tell least, along which lower minima are looked for."""
 _SEARCH_STD = np.array([-6.0, -5.0, -4.0, -3.0, -2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0])
 """How far along each, standard deviations."""
-_SEARCH_MOST = 1.0
-"""Cap on a standard deviation that a search goes by (natural units); beyond it the landmark leaves the image."""
 _SEARCH_FROM, _SEARCH_SETTLED = 3, 0.03
 """From how many of these places it descends by slopes over standard deviations, and until steps promise so little."""
 _WIDTHS = (0.5, 1.0, 2.0)
@@ -63,12 +59,8 @@ _SEARCHES, _GAINED = 4, 0.1
 """How often the search is repeated about what it found, unless it saved less."""
 FALSE_ALARM = 0.01
 """A fit whose χ² is exceeded with less than this probability does not fit."""
-_MINIMA_COST = 50.0
-"""χ² that ending in a small minimum may cost; what fits worse has other reasons."""
 _POSES_FOR_ERRORS, _ROUNDS = 6, 2
 """Fewer poses do not tell the size of their errors; how often these sizes and the mounting are estimated in turn."""
-_POSES_FOR_SANDWICH = 3
-"""Poses for each free parameter from which their own scatter tells the covariance."""
 _STD_STARTS = np.log([2e-4, math.radians(0.02), math.radians(0.02)]) + np.array([[0.0], [2.0], [4.0]])
 """Logarithms of the sizes of the poses' errors, metres and radians, where three descents begin."""
 _STD_BOUNDS = [(math.log(1e-6), math.log(most)) for most in (0.1, math.radians(10.0), math.radians(10.0))]
@@ -102,7 +94,8 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
     check_pixels(use, poses)
     check_observable(fit.information(theta, use), fit.free, fit.scale, poses)
     place = fit.solve(theta, use)
-    if fit.p_value(place, less=_MINIMA_COST) >= FALSE_ALARM:
+    minima_cost = 50.0  # χ² that ending in a small minimum may cost; what fits worse has other reasons
+    if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
         place = fit.search(place)
     estimated = None
     if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
@@ -131,7 +124,8 @@ def _solution(
     count = use.sum(axis=1) * fit.evidence.per_pixel
     if dof > 0 and p_value < FALSE_ALARM:
         excess, n, p = place.cost / expected, len(poses), len(fit.free)
-        if n >= _POSES_FOR_SANDWICH * p:
+        poses_for_sandwich = 3  # poses for each free parameter from which their own scatter tells the covariance
+        if n >= poses_for_sandwich * p:
             covariance = plain @ scatter @ plain * n / (n - p)
             source = "the scatter of the poses (sandwich), for the residuals are more than noise"
         else:
@@ -524,8 +518,11 @@ class StillFit:
         _, own_gradient = wide.gradients(self._pull(place), place.u)
         covariance = covariance_of(wide.information, self.scale, weak="wide")
         values, vectors = np.linalg.eigh(covariance / np.outer(self.scale, self.scale))
-        ways = self.scale[:, None] * vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), _SEARCH_MOST)
-        steps = (_SEARCH_STD[:, None, None] * ways[:, -_SEARCHED:].T).reshape(-1, len(self.columns))
+        # cap on a standard deviation that a search goes by (natural units); beyond it the landmark leaves the image
+        search_most = 1.0
+        ways = self.scale[:, None] * vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), search_most)
+        searched = 3  # directions, of those that the poses tell least, along which lower minima are looked for
+        steps = (_SEARCH_STD[:, None, None] * ways[:, -searched:].T).reshape(-1, len(self.columns))
 
         def stepped(step: NDArray[np.float64]) -> Place:
             return self._stepped(place, wide, own_gradient, step)

@@ -172,8 +172,6 @@ def _flags_of(orientation: Orientation) -> str:
     return f"{'--flip-h' if orientation.flip_h else ''} {turn}".strip()
 
 
-_WIDEST = 88
-"""A single answer that is wider than this is printed one number a line."""
 _OUTSIDE = "outside the bank"
 
 
@@ -251,6 +249,7 @@ class _Answers:
         return answer
 
     def _print(self, answers: Sequence[dict[str, Any]], start: int, columns: Columns) -> None:
+        widest = 88  # A single answer that is wider than this is printed one number a line.
         if self.results.as_json:
             self.answers += answers
         elif self.results.as_jsonl:
@@ -259,7 +258,7 @@ class _Answers:
         else:
             rows = match_rows(answers, start, columns)
             width = sum(max(len(title), len(value)) + 2 for title, value in rows[0].items())
-            if self.search.on == "reported" and columns.counted is None and width > _WIDEST:
+            if self.search.on == "reported" and columns.counted is None and width > widest:
                 echo_facts(rows[0])
                 return
             self.table = self.table or Table(list(rows[0]))

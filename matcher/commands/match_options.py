@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.render import Background, Frames
 
-_DRAWN_ALL = 4
-"""Most positions that are drawn unless the user says which, also in the help; a figure takes two seconds."""
 
 _REFINED = (
     "free", "on", "pixels", "robust", "auto_background", "unknown_background", "no_background", "fix", "bearing_std",
@@ -412,7 +410,9 @@ class Results:
         if self.plot_index is not None:
             indices = parse_indices(self.plot_index, n, "--plot-index")
         else:
-            indices = list(range(n if n <= _DRAWN_ALL else 1))
+            # most positions that are drawn unless the user says which, also in the help; a figure takes two seconds
+            drawn_all = 4
+            indices = list(range(n if n <= drawn_all else 1))
         return {k: self.plot if n == 1 else self.plot.with_stem(f"{self.plot.stem}-{k}") for k in indices}
 
     def files(self, plots: dict[int, Path]) -> list[Path]:

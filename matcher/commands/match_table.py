@@ -128,12 +128,6 @@ def summary(reasons: Sequence[str], counted: str) -> str:
     return f"{accepted} of {len(reasons)} {counted}s accepted" + (f"; refused: {refused}" if refused else "")
 
 
-_MANY = 0.1
-"""Share of answers at an end of a bank from which it is worth a note."""
-_PILED_UP = 3.0
-"""Ratio to the share that each distance of the bank would have if all were equally frequent."""
-
-
 def bank_ends(found_m: Sequence[float], grid_m: Sequence[float], counted: str) -> list[str]:
     """Return a sentence for each end of a bank's distances where answers pile up.
 
@@ -152,7 +146,9 @@ def bank_ends(found_m: Sequence[float], grid_m: Sequence[float], counted: str) -
         (sum(distance_m <= first + 1e-9 for distance_m in known), f"begins at {first:g} m", "nearer"),
         (sum(distance_m >= last - 1e-9 for distance_m in known), f"ends at {last:g} m", "farther"),
     )
-    least = max(_MANY, _PILED_UP / len(grid_m)) * len(known)
+    many = 0.1  # share of answers at an end of a bank from which it is worth a note
+    piled_up = 3.0  # ratio to the share that each distance of the bank would have if all were equally frequent
+    least = max(many, piled_up / len(grid_m)) * len(known)
     return [
         f"the bank {where}, where {n} of {len(known)} {counted}s have their best fit: if the landmark may be {further},"
         " build it with a wider --distance"

@@ -33,7 +33,6 @@ from phasemark.render import Renderer, Sensor, Views
 SIDE_STEP_DEG = 3.75
 _CONTENDERS, _AGAIN, _FRESH, _ANYWHERE = 3, 4, 12, 4
 """How many of the worst sides are looked at again, and how many times `n` frames that, the worst and anywhere take."""
-_BANK_STEPS = 150
 _BANK_STEP_M = 0.01
 _FRAMES_AT_ONCE = 200
 
@@ -151,7 +150,8 @@ def confirm(
     Confirmation
     """
     near, far = plan.distance_m
-    step = max(_BANK_STEP_M, (far - near) / _BANK_STEPS)
+    bank_steps = 150
+    step = max(_BANK_STEP_M, (far - near) / bank_steps)
     bank_plan = BankPlan(
         landmarks=scored.specs,
         sensor=plan.sensor,

@@ -13,8 +13,6 @@ from phasemark.matcher.design.search import Candidate, Design, Scored
 from phasemark.render.charts import explain, logarithmic, panels, with_intervals
 
 _NEW, _OLD, _GREY, _FRONT = "#2a6fbb", "#c8553d", "#b9bec4", "#1a1a1a"
-_INFINITE = 1.15
-"""Where a square's distance from itself turned is drawn, in units of the largest other: it has none."""
 
 
 def pareto_figure(design: Design) -> Figure:
@@ -43,7 +41,9 @@ def pareto_figure(design: Design) -> Figure:
     else:
         left.text(0.5, 0.5, "one class: nothing to distinguish", ha="center", transform=left.transAxes)
     finite = [c.turn_distance for c in design.candidates if np.isfinite(c.turn_distance)]
-    top = _INFINITE * max([*finite, known.turn_distance, limits.least_turn_distance])
+    # where a square's distance from itself turned is drawn, in units of the largest other: it has none
+    infinite = 1.15
+    top = infinite * max([*finite, known.turn_distance, limits.least_turn_distance])
     _scatter(right, design.candidates, [min(c.turn_distance, top) for c in design.candidates])
     _mark(right, known, known.turn_distance, "catalogue", _OLD)
     _mark(right, design.result, min(design.result.turn_distance, top), "chosen", _NEW)

@@ -29,8 +29,6 @@ from phasemark.matcher.statistics import ratio_interval
 Confirmed = tuple[Confirmation, Confirmation]
 """Of the result and of the catalogue."""
 
-_MESH_TOLERANCE_M = 1e-5
-
 
 def output_names(plan: DesignPlan) -> list[str]:
     """Return the files that :func:`write_design` writes."""
@@ -199,7 +197,8 @@ def _confirmation_facts(confirmation: Confirmation) -> dict[str, Any]:
 
 def mesh_stl(spec: LandmarkSpec) -> bytes:
     """Return a landmark as STL in millimetres, as workshops and printers expect it."""
-    mesh = build_mesh(spec, tolerance_m=_MESH_TOLERANCE_M)
+    mesh_tolerance_m = 1e-5
+    mesh = build_mesh(spec, tolerance_m=mesh_tolerance_m)
     return export_mesh(trimesh.Trimesh(mesh.vertices * 1000, mesh.faces, process=False), "stl")
 
 

@@ -20,10 +20,6 @@ from phasemark.landmarks.spec import Box, Sphere, Upper
 from phasemark.matcher.design.plan import DesignPlan
 from phasemark.render import Sensor, predicted_range_std
 
-_SLANT_COSINE = 0.5
-_ROUNDING_M = 1e-9
-"""Dimensions are decimal; sums of them may miss a limit by the last bit."""
-
 
 @dataclass(frozen=True)
 class Check:
@@ -50,9 +46,10 @@ class Check:
     @property
     def passes(self) -> bool:
         """Whether the rule is kept."""
+        rounding_m = 1e-9  # dimensions are decimal; sums of them may miss a limit by the last bit
         if self.at_most:
-            return bool(self.value <= self.limit + _ROUNDING_M)
-        return bool(self.value >= self.limit - _ROUNDING_M)
+            return bool(self.value <= self.limit + rounding_m)
+        return bool(self.value >= self.limit - rounding_m)
 
     def __str__(self) -> str:
         sign = "at most" if self.at_most else "at least"
@@ -222,7 +219,8 @@ class AllowedDimensions:
 
     def _light(self) -> Iterator[Check]:
         far = self.plan.distance_m[1]
-        amplitude = self.plan.albedo * _SLANT_COSINE / far**2
+        slant_cosine = 0.5
+        amplitude = self.plan.albedo * slant_cosine / far**2
         std = max(
             float(predicted_range_std(amplitude, amplitude, camera)) / camera.metres_per_radian
             for camera in self.sensor.by_frequency

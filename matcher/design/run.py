@@ -13,9 +13,6 @@ from phasemark.matcher.design.rules import Check, upper_size
 from phasemark.matcher.design.search import Candidate, Design, Search
 from phasemark.matcher.design.shapes import box_of, sample_boxes
 
-_USUAL_REFINEMENT = 600
-"""Steps of the refinement that a progress bar reckons with."""
-
 
 def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progress | None = None) -> Design:
     """Search a set of landmarks for a camera and a working range; the same plan gives the same set.
@@ -41,7 +38,8 @@ def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progre
         The sensor file cannot be read.
     """
     search = Search(plan, workers or os.cpu_count() or 1)
-    step = counter(progress, plan.search.boxes + plan.search.uppers + _USUAL_REFINEMENT)
+    usual_refinement = 600  # steps of the refinement that a progress bar reckons with
+    step = counter(progress, plan.search.boxes + plan.search.uppers + usual_refinement)
     search.look_at_uppers(step)
     found: list[Candidate] = []
     for steps in sample_boxes(plan, search.allowed, search.lattice):

@@ -25,8 +25,6 @@ from phasemark.render import Renderer, Sensor, Views
 
 _TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))
 _TURN_SHIFT_M = np.arange(-0.06, 0.061, 0.015)
-_TURN_SIDES = 7
-_GAUSS_NEWTON_STEPS = 4
 
 
 def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearance:
@@ -146,19 +144,21 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
     renderer = phases_of(Renderer(build_mesh(box_alone(box, plan)), sensor, albedo=plan.albedo))
     rows = renderer.sensor.lower_rows
     far = plan.distance_m[1]
-    sides = np.linspace(0.0, math.pi / 2, _TURN_SIDES)
+    turn_sides = 7
+    sides = np.linspace(0.0, math.pi / 2, turn_sides)
     truth = Appearance.of(renderer, Views.broadcast(far, sides), (), rows, plan.n_frames)
     shift, turn = (grid.ravel() for grid in np.meshgrid(_TURN_SHIFT_M, _TURN_BIAS_RAD, indexing="ij"))
-    place = np.empty((_TURN_SIDES, 2))
+    place = np.empty((turn_sides, 2))
     for k, side in enumerate(sides):
         views = Views.broadcast(far + shift, side + math.pi / 2 + turn)
         others = Appearance.of(renderer, views, (), rows, plan.n_frames)
         best = int(truth.one(k).imitated_by(others)[0].argmin())
         place[k] = views.distance_m[best], views.delta_rad[best]
     turned = sides + math.pi / 2
-    bounds = [np.c_[np.full(_TURN_SIDES, far + _TURN_SHIFT_M[end]), turned + _TURN_BIAS_RAD[end]] for end in (0, -1)]
-    least = np.full(_TURN_SIDES, np.inf)
-    for _ in range(_GAUSS_NEWTON_STEPS):
+    bounds = [np.c_[np.full(turn_sides, far + _TURN_SHIFT_M[end]), turned + _TURN_BIAS_RAD[end]] for end in (0, -1)]
+    least = np.full(turn_sides, np.inf)
+    gauss_newton_steps = 4
+    for _ in range(gauss_newton_steps):
         views = Views.broadcast(place[:, 0], place[:, 1])
         other = Appearance.of(renderer, views, ("distance_m", "delta_rad"), rows, plan.n_frames)
         cost, gradient, information = truth.imitated_by(other)

@@ -58,11 +58,8 @@ WORTH_A_MATCH = 60.0
 """Cost above what noise explains up to which a rough fit is matched: two pixels that contradict it, and a little."""
 CLEARLY_ASIDE_RAD = math.radians(0.5)
 """Before a background a rough fit knows the bearing better than that."""
-_MIXING = 0.5
-"""Least share of pixels that return where something stands behind the landmark, so that zones see two surfaces."""
 _FACTORS = (1000.0, 100.0, 10.0, 0.1, 0.01, 0.001)
 _WINDOW_M, _WINDOW_RAD = 0.01, math.radians(1.0)
-_WINDOW_STEPS = 4
 
 
 @dataclass(frozen=True)
@@ -398,7 +395,9 @@ class _Trials:
         """Match as ranges that a chip reports, where the sensor is one and zones may see a background too."""
         if self.bank.sensor.histogram is None or not self.on_ranges:
             return []
-        if (self.frame.state == PixelState.RETURN).mean() < _MIXING:
+        # least share of pixels that return where something stands behind the landmark, so that zones see two surfaces
+        mixing = 0.5
+        if (self.frame.state == PixelState.RETURN).mean() < mixing:
             return []
         match = Matcher(self.bank, "refine", on="reported", false_alarm=self.plain.false_alarm).match(self.frame)[0]
         change = Change("on", "reported", "ranges as the chip reports them, of the nearest surface of each zone")
@@ -554,7 +553,8 @@ class _Trials:
         background: _Behind,
     ) -> Match | None:
         """Match before a small bank of one class about a rough fit; None if it is refused."""
-        steps = np.arange(-_WINDOW_STEPS, _WINDOW_STEPS + 1)
+        window_steps = 4
+        steps = np.arange(-window_steps, window_steps + 1)
         distance_m = rough.distance_m + _WINDOW_M * steps
         delta_deg = np.degrees(rough.delta_rad + _WINDOW_RAD * steps)
         with suppress(UsageError):  # a lens inside the landmark, a wall before it

@@ -36,13 +36,10 @@ _MIXED_OFFSETS_M = (-0.1, -0.06, -0.03, -0.01, 0.01)
 _BEARING_OFFSETS_COLUMNS = (-0.3, 0.0, 0.3)
 _REFINED = (4, 2, 1)
 """How many views are refined with more slack, with less, and with none."""
-_KEPT = 16
-_ITERATIONS = 6
 _SLACKS_M = (0.012, 0.003)
 """Added to the noise, metres: in the search, which has to separate views, and in the refinement."""
 _STEPS = (1e-4, 1e-4, 1e-4, 1e-4)
 _COVERAGE_SEEN, _COVERAGE_MUST = 1e-4, 0.4
-_MOST_CLASSES = 6
 _NEAR_WALL, _FEWEST_ON_WALL = 0.05, 6
 
 
@@ -118,12 +115,14 @@ class Search:
         free = [0, 1] + ([2] if bearing else []) + ([3] if len(sizes) > 1 else [])
         rows = self._sensor.lower_rows if self._shared else None
         starts: list[tuple[float, int, NDArray[np.float64]]] = []
-        for c in range(1 if self._shared else min(len(self._names), _MOST_CLASSES)):
+        kept = 16
+        most_classes = 6
+        for c in range(1 if self._shared else min(len(self._names), most_classes)):
             views = self._grid(c, frame, sizes, bearing, mixed=background is not None)
             cost = self._costs(c, views, coarse, background, rows)
-            starts += [(float(cost[k]), c, views[k]) for k in np.argsort(cost, kind="stable")[:_KEPT]]
+            starts += [(float(cost[k]), c, views[k]) for k in np.argsort(cost, kind="stable")[:kept]]
         starts.sort(key=lambda start: start[0])
-        starts = starts[: _KEPT // 2]
+        starts = starts[: kept // 2]
         if self._shared:
             starts = [(0.0, c, view) for _, _, view in starts for c in range(len(self._names))]
         whole: list[tuple[float, int, NDArray[np.float64]]] = []
@@ -231,7 +230,8 @@ class Search:
         """Lower the cost by damped least squares (Levenberg–Marquardt)."""
         damping = 1e-2
         cost = math.inf
-        for _ in range(_ITERATIONS):
+        iterations = 6
+        for _ in range(iterations):
             tried = np.stack([view, *(view + step * np.eye(4)[k] for k, step in enumerate(_STEPS) if k in free)])
             residual, mismatch = self._residuals(c, tried, seen, background)
             if not np.isfinite(residual).all():

@@ -8,9 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-_AIM_ROUNDS = 4
-"""The lens moves as the camera turns, by millimetres of a metre: each round leaves about a tenth of the error."""
-
 
 class Path:
     """A path of straight pieces, walked once from one end to the other.
@@ -114,7 +111,9 @@ def pan_towards(
     pan_offset_m, lens_offset_m : (2,) array_like
     """
     pan = 0.0
-    for _ in range(_AIM_ROUNDS):
+    # the lens moves as the camera turns, by millimetres of a metre: each round leaves about a tenth of the error
+    aim_rounds = 4
+    for _ in range(aim_rounds):
         to = np.asarray(target_m) - lens_pose(pose, pan, pan_offset_m, lens_offset_m)[:2]
         pan = math.remainder(math.atan2(to[1], to[0]) - pose[2], math.tau)
     return pan

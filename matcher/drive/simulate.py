@@ -30,8 +30,6 @@ from phasemark.render import Background, Renderer, Sensor, Views, capture
 FREE = ("distance_m", "delta_rad", "bearing_rad")
 """The robot points the camera by its own wrong estimate, so the bearing is unknown too."""
 _BANK_STEP_M, _BANK_STEP_DEG, _BANK_MARGIN_M = 0.02, 2.0, 0.3
-_MOST_WAY = 1.5
-"""A robot that has driven this many times the length of its path has lost it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,6 +295,7 @@ class _Driver:
         path, plan = self.path, self.plan
         next_look_m = 0.0
         self._note()
+        most_way = 1.5  # A robot that has driven this many times the length of its path has lost it.
         while not path.is_done:
             if self.way_m >= next_look_m:
                 next_look_m += plan.stop.every_m
@@ -304,7 +303,7 @@ class _Driver:
                 if progress is not None:
                     progress(round(100 * path.progress_m), round(100 * path.length_m))
             self._step()
-            if self.way_m > _MOST_WAY * path.length_m + 1:
+            if self.way_m > most_way * path.length_m + 1:
                 raise UsageError(
                     f"the robot has lost its path after {self.way_m:.1f} m: give 'path.lookahead_m' or"
                     " 'path.turn_limit_deg_s' room for its corners, or let it see a landmark earlier"

@@ -25,10 +25,6 @@ __all__ = ["TOLERATED_SIGMA", "Rules", "answer_of", "is_acceptable", "no_answer"
 
 TOLERATED_SIGMA = 3.0
 """Standard deviations that must lie within the tolerance of an accepted answer."""
-_AMBIGUITY = 1e-3
-"""Largest probability that an accepted answer leaves to other classes."""
-_SAME_SIGMA = 3.0
-"""Fits of one class nearer to each other than this many standard deviations are of one posterior."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,11 +231,12 @@ def _log_shares(rules: Rules, fits: Fits, kept: list[int]) -> NDArray[np.float64
     in_ranges = information * ranges[:, :, None] * ranges[:, None] / (2 * np.pi)
     shares = -0.5 * np.log1p(np.maximum(np.linalg.eigvalsh(in_ranges), 0.0)).sum(axis=1)
     views = fits.view[kept][:, [VIEW_FIELDS.index(name) for name in rules.free]]
+    same_sigma = 3.0  # fits of one class nearer to each other than this many standard deviations are of one posterior
     for k in range(1, len(kept)):
         better = np.flatnonzero((classes[:k] == classes[k]) & np.isfinite(shares[:k]))
         off = views[k] - views[better]
         off[:, turn] = wrap_delta_difference_rad(off[:, turn], periods[k])
-        if (np.einsum("jp,jpq,jq->j", off, information[better], off) < _SAME_SIGMA**2).any():
+        if (np.einsum("jp,jpq,jq->j", off, information[better], off) < same_sigma**2).any():
             shares[k] = -np.inf
     return np.asarray(shares)
 
@@ -289,7 +286,8 @@ def _is_ambiguous(rules: Rules, fits: Fits, kept: list[int], weights: Sequence[N
     """
     best = kept[0]
     other = fits.class_index[kept] != fits.class_index[best]
-    if any(weight[other].sum() > _AMBIGUITY * weight.sum() for weight in weights):
+    ambiguity = 1e-3  # largest probability that an accepted answer leaves to other classes
+    if any(weight[other].sum() > ambiguity * weight.sum() for weight in weights):
         return True
     # where a landmark looks alike from two sides, a single pixel at an edge must not decide between them
     alike = np.flatnonzero(~other & (fits.cost[kept] < fits.cost[best] + rules.rival_cost))

@@ -21,9 +21,6 @@ from numpy.typing import NDArray
 
 _Float = NDArray[np.float64]
 
-_CHUNK = 10
-"""Frames in one matrix product."""
-
 
 class Marginal(NamedTuple):
     """Problem of the common parameters alone, the errors of frames and blocks eliminated."""
@@ -154,11 +151,12 @@ class RandomEffects:
 
 def _summed(a: _Float, b: _Float) -> _Float:
     """Return the sum over k of a_k b_kᵀ, in products too small for a BLAS to spread them over busy processors."""
-    n = -(-len(a) // _CHUNK)
-    padding = ((0, n * _CHUNK - len(a)), (0, 0), (0, 0))
+    chunk = 10  # frames in one matrix product
+    n = -(-len(a) // chunk)
+    padding = ((0, n * chunk - len(a)), (0, 0), (0, 0))
 
     def chunks(one: _Float) -> _Float:
-        whole = np.pad(one, padding).reshape(n, _CHUNK, one.shape[1], one.shape[2])
+        whole = np.pad(one, padding).reshape(n, chunk, one.shape[1], one.shape[2])
         return np.ascontiguousarray(whole.transpose(0, 2, 1, 3)).reshape(n, one.shape[1], -1)
 
     return np.asarray((chunks(a) @ chunks(b).transpose(0, 2, 1)).sum(axis=0))

@@ -27,11 +27,6 @@ _ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effecti
 """Fields of filtered frames with a number for each pixel."""
 _USUAL_LIMIT_RAD = 0.1
 """Phase noise where a frame does not know its own and the sensor allows no less."""
-_CHIP_ERROR_BINS = 0.03
-"""Error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that bends
-within a zone, or of things beside it."""
-_LEAST_POOLED = 1e-4
-"""Least variance over that of the law; frames without any scatter are simulated, or frozen."""
 
 
 class PixelState(IntEnum):
@@ -152,7 +147,10 @@ class FilteredFrames:
         histogram = self.sensor.histogram
         if histogram is None or not self.n_effective.max(initial=0.0) > 1:
             return self
-        return replace(self, std_m=np.hypot(self.std_m, _CHIP_ERROR_BINS * histogram.bin_width_m))
+        # error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that
+        # bends within a zone, or of things beside it
+        chip_error_bins = 0.03
+        return replace(self, std_m=np.hypot(self.std_m, chip_error_bins * histogram.bin_width_m))
 
     def with_pooled_noise(self) -> FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
@@ -174,7 +172,9 @@ class FilteredFrames:
             freedom = float(np.median(n[k][scattered])) - 1
             usual = float(special.chdtri(freedom, 0.5)) / freedom
             scale[k] = float(np.median(ratio[k][scattered])) / usual
-        std = np.sqrt(np.maximum(scale, _LEAST_POOLED)) * law / np.sqrt(np.maximum(n, 1.0))
+        # least variance over that of the law; frames without any scatter are simulated, or frozen
+        least_pooled = 1e-4
+        std = np.sqrt(np.maximum(scale, least_pooled)) * law / np.sqrt(np.maximum(n, 1.0))
         return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False)
 
     def _repr_png_(self) -> bytes | None:

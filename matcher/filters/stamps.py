@@ -7,9 +7,6 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-_SAME_GAP = 0.25
-"""Share of a period by which a gap may differ from a whole number of them."""
-
 
 def stamp_jitter(stamps_s: NDArray[np.float64]) -> float:
     """Return how far stamps are at least uncertain, standard deviation in seconds.
@@ -45,15 +42,16 @@ def spread_stamps(stamps_s: NDArray[np.float64]) -> NDArray[np.float64]:
         return stamps_s
     period = float(np.median(per_frame[per_frame > 0]))
     out = stamps_s.copy()
+    same_gap = 0.25  # share of a period by which a gap may differ from a whole number of them
     for start, end in zip(starts, ends, strict=True):
         k = end - start
         if k == 1:
             continue
         before = stamps_s[start] - stamps_s[start - 1] if start else np.inf
         after = stamps_s[end] - stamps_s[start] if end < len(stamps_s) else np.inf
-        if abs(before - k * period) < _SAME_GAP * period:
+        if abs(before - k * period) < same_gap * period:
             out[start:end] = stamps_s[start] - before + before / k * np.arange(1, k + 1)
-        elif abs(after - k * period) < _SAME_GAP * period:
+        elif abs(after - k * period) < same_gap * period:
             out[start:end] = stamps_s[start] + after / k * np.arange(k)
     return out
 

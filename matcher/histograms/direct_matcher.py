@@ -23,10 +23,7 @@ from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
 
 _WIDEST_BEARING_RAD = math.radians(4.0)
-_BEARING_SIGMA = 2.0
-"""A free bearing has two further tables of histograms, as far aside as these say."""
 _STEEPEST_RAD = math.radians(20.0)
-_NEAREST_WALL_M = 0.1
 _T = TypeVar("_T")
 
 
@@ -63,7 +60,8 @@ class DirectMatcher:
         self.grid = plan_table(self.signals, bank.distance_m, bank.delta_rad, math.gcd(*rules.symmetry))
         histogram = histogram_of(self.sensor)
         far_m = histogram.start_m + histogram.bins * histogram.bin_width_m
-        self.free_wall = (_NEAREST_WALL_M, far_m) if background == "auto" else None
+        nearest_wall_m = 0.1
+        self.free_wall = (nearest_wall_m, far_m) if background == "auto" else None
         behind = Background(wall_m=far_m) if isinstance(background, str) else background
         self.background = behind if planes_of(behind) else None
         self.limits = _view_limits(self.grid, None if self.free_wall else self.background)
@@ -77,7 +75,8 @@ class DirectMatcher:
         """Bearings at which a table is made."""
         if "bearing_rad" not in self.free:
             return (0.0,)
-        side = min(_BEARING_SIGMA * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
+        bearing_sigma = 2.0  # A free bearing has two further tables of histograms, as far aside as these say.
+        side = min(bearing_sigma * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
         return (0.0, -side, side)
 
     def _on_threads(self, work: Callable[[_T], Match], frames: Sequence[_T]) -> list[Match]:

@@ -15,19 +15,12 @@ from phasemark.matcher.histograms.scene_prediction import shifted
 from phasemark.matcher.histograms.table_search import BRIGHTEST, DIMMEST
 from phasemark.render.view import VIEW_FIELDS
 
-_INNER_STEPS = 12
 _INNER_SHARES = (1.0, 0.3, 0.09, 0.027)
-_INNER_DONE = 1e-2  # squared standard deviations
-_NEAR_ENOUGH = 0.7
-"""A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it."""
 _SETTLED = 0.05
 """A nuisance that moves by less than this share of its longest step needs no other scene."""
 _SHRINK, _LEAST_SHRINK = 0.3, 0.05
-_WORSE = 0.5
-"""A scene may be so much worse than the linear one that led to it: less than what a test can see."""
 _SAME = np.array([0.005, *[math.radians(1.0)] * 2, 0.005, *[math.radians(1.0)] * 2])
 """A fit this near to another one, on its way, ends where that one did."""
-_NO_INFORMATION = 1e-300
 LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
 """Longest step of a view between two scenes, by unit."""
 _LONGEST_LOG_BRIGHT = 0.5
@@ -181,9 +174,14 @@ def fit_view(
     n_free, shrink = len(search.free), 1.0
     step = np.zeros(len(search.columns))
     state, bright, ambient = np.clip(start.state, *search.limits), start.bright, start.ambient
+    inner_steps = 12
+    inner_done = 1e-2  # squared standard deviations
+    # A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it.
+    near_enough = 0.7
+    worse = 0.5  # A scene may be so much worse than the linear one that led to it: less than what a test can see.
     for _ in range(most):
         here = _linear_scene(search, frame, state, bright, ambient)
-        if best is not None and here.cost > best.cost + _WORSE:
+        if best is not None and here.cost > best.cost + worse:
             shrink *= _SHRINK
             if shrink < _LEAST_SHRINK:
                 break
@@ -191,13 +189,13 @@ def fit_view(
             continue
         longest = np.append(search.longest, _LONGEST_LOG_BRIGHT)
         there, left, _ = descend(
-            here, longest, most=_INNER_STEPS, done=_INNER_DONE, shares=_INNER_SHARES, excess=_LinearScene.excess
+            here, longest, most=inner_steps, done=inner_done, shares=_INNER_SHARES, excess=_LinearScene.excess
         )
         step, shrink = there.offset + left[:-1], 1.0  # what is left changes neither the counts nor their slopes
         best = here.fit(state, there.view_information)
         state, bright, ambient = search.moved(state, step), there.bright, there.ambient
         settled = (np.abs(step[n_free:]) <= _SETTLED * search.longest[n_free:]).all()
-        if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < _NEAR_ENOUGH**2:
+        if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < near_enough**2:
             return there.fit(state, there.view_information)
         near = (np.abs(state[: len(VIEW_FIELDS)] - other) < _SAME for other in known)
         if there.cost > hopeless or any(one.all() for one in near):
@@ -257,8 +255,9 @@ class _LinearScene:
     def view_information(self) -> NDArray[np.float64]:
         """Information in the view alone, brightness and nuisances eliminated."""
         whole = self.information
+        no_information = 1e-300
         while len(whole) > len(self._search.free):
-            own = max(float(whole[-1, -1]), _NO_INFORMATION)
+            own = max(float(whole[-1, -1]), no_information)
             whole = whole[:-1, :-1] - np.outer(whole[:-1, -1], whole[-1, :-1]) / own
         return whole
 

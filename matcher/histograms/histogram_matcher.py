@@ -23,16 +23,10 @@ from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.view import VIEW_FIELDS
 
-_TABLE_ERROR = 4.0
-"""How far the table may be wrong about another hill, over how far it was off for the best one."""
-_MOST_FITS = 8
-_OF_CLASS = 4
-"""Starts of each class that a joint fit follows to the end."""
 _SAME_M, _SAME_RAD = 0.02, math.radians(5.0)
 _OWN = VIEW_FIELDS[:3]
 _NEAR = np.array([0.05, *[math.radians(15.0)] * 2, 0.0, 0.0, 0.0])
 """What a frame by itself may have otherwise than all frames together, and how far."""
-_TESTS = 3
 
 Found = list[tuple[int, Fit]]
 """Classes and fits."""
@@ -56,7 +50,10 @@ class HistogramMatcher(HistogramSearch):
         least = starts[0].cost
         fits: Found = []
         offset, margin, n_tried = 0.0, SURE_COST, 0
-        for start in starts[:_MOST_FITS]:
+        # how far the table may be wrong about another hill, over how far it was off for the best one
+        table_error = 4.0
+        most_fits = 8
+        for start in starts[:most_fits]:
             if fits and start.cost > least + margin:
                 break
             n_tried += 1
@@ -64,7 +61,7 @@ class HistogramMatcher(HistogramSearch):
                 continue
             if len(fits) == 1:
                 offset = fits[0][1].cost - least  # of the exact deviance over that of the table
-                margin += _TABLE_ERROR * abs(offset)
+                margin += table_error * abs(offset)
         others = [Explanation(one.class_index, one.view, one.cost + offset, None) for one in starts[n_tried:]]
         best_class, best = _best(fits)
         estimated = _estimated(self.searches[best_class], frame)
@@ -100,8 +97,9 @@ class HistogramMatcher(HistogramSearch):
                 first.append(start._replace(state=fit.state, bright=fit.bright, ambient=fit.ambient, cost=fit.cost))
         first.sort(key=lambda start: start.cost)
         fits: Found = []
+        of_class = 4  # starts of each class that a joint fit follows to the end
         for c, search in enumerate(searches):
-            for start in [start for start in first if start.class_index == c][:_OF_CLASS]:
+            for start in [start for start in first if start.class_index == c][:of_class]:
                 _follow(fits, search, joint, start)
         best_class, best = _best(fits)
         estimated = _estimated(searches[best_class], joint)
@@ -204,7 +202,8 @@ def _joint_test(best: Fit, joint: Counted, estimated: int, apart: Sequence[float
         each = min(each, deviance_test(deviance, *moments_of(level), round(estimated / n))[2])
         gain += max(deviance - least, 0.0)
     agree = float(special.chdtrc(more, gain)) if more > 0 else 1.0
-    return FitTest(chi2, dof, min(1.0, _TESTS * min(whole, n * each, agree)))
+    tests = 3
+    return FitTest(chi2, dof, min(1.0, tests * min(whole, n * each, agree)))
 
 
 def _counted(frames: HistogramFrames) -> list[Counted]:

@@ -24,8 +24,6 @@ SURE_COST = 40.0
 """A fit this much worse than the best one can neither be the answer nor make it ambiguous."""
 SCENES, _TABLE_SCENES = 8, 5
 """Scenes that a fit renders at most, or takes from a table."""
-_WALLS = 4
-_WALL_STEP_OF_RESPONSE = 0.75
 _TURNS = ("bearing_rad", "pitch_rad", "roll_rad")
 """What of a view moves planes in the image."""
 
@@ -100,7 +98,8 @@ class HistogramSearch(DirectMatcher):
         """Backgrounds before which a landmark is looked for: a wall that is free stands at many distances."""
         if self.background is None or self.free_wall is None:
             return [self.background]
-        step = _WALL_STEP_OF_RESPONSE * response_width_m(self.sensor)
+        wall_step_of_response = 0.75
+        step = wall_step_of_response * response_width_m(self.sensor)
         distances_m = np.arange(float(self.limits[0, 0]), self.free_wall[1], step)
         return [replace(self.background, wall_m=float(wall_m)) for wall_m in distances_m]
 
@@ -195,7 +194,8 @@ class HistogramSearch(DirectMatcher):
         gain = (along**2 / np.maximum(np.einsum("wzj,zj->wz", light**2, weight), 1e-300)).sum(axis=1)
         padded = np.pad(gain, 1, constant_values=-1.0)
         peak = np.flatnonzero((gain >= padded[:-2]) & (gain > padded[2:]))
-        return [int(w) for w in peak[np.argsort(-gain[peak])][:_WALLS]]
+        walls = 4
+        return [int(w) for w in peak[np.argsort(-gain[peak])][:walls]]
 
 
 def _shifted_back(counts: NDArray[np.float64], bins: float) -> NDArray[np.float64]:

@@ -23,14 +23,9 @@ from phasemark.render.view import delta_period_rad
 
 STATISTICS = 3
 """Numbers that the search keeps of a zone's histogram: its sum, first and second moment about the window's middle."""
-_STEP_OF_RESPONSE = 0.75
 _STEP_RAD = math.radians(4.0)
-_NEAREST_TO_SURFACE_M = 0.02
 _DARK = 1e-5  # of the brightest zone's light: less does not light a zone
-_FEWEST_NODES = 4  # of a cubic
 _SAME_RAD = 1e-6
-_COARSE_M = 1.0
-"""Shares of planes need no ranges: cells of a floor are not cut."""
 
 
 class Table(NamedTuple):
@@ -121,18 +116,21 @@ def plan_table(
     sensor = signals[0].sensor
     corners = np.concatenate([one.vertices for one in signals])
     radius = float(np.hypot(corners[:, 0], corners[:, 1]).max())
-    step = _STEP_OF_RESPONSE * response_width_m(sensor)
-    low = max(float(distance_m[0]) - step, radius + _NEAREST_TO_SURFACE_M)
-    n = max(math.ceil((float(distance_m[-1]) + step - low) / step) + 1, _FEWEST_NODES)
+    step_of_response = 0.75
+    step = step_of_response * response_width_m(sensor)
+    nearest_to_surface_m = 0.02
+    low = max(float(distance_m[0]) - step, radius + nearest_to_surface_m)
+    fewest_nodes = 4  # of a cubic
+    n = max(math.ceil((float(distance_m[-1]) + step - low) / step) + 1, fewest_nodes)
     distances = np.asarray(low + step * np.arange(n), dtype=np.float64)
     first, window = _window(sensor, distances, radius, float(np.abs(corners[:, 2]).max()))
     period = delta_period_rad(symmetry)
     span = float(np.ptp(delta_rad))
     if span + (float(np.diff(delta_rad).max()) if len(delta_rad) > 1 else 0.0) > period - _SAME_RAD:
-        n = max(math.ceil(period / _STEP_RAD), 2 * _FEWEST_NODES)
+        n = max(math.ceil(period / _STEP_RAD), 2 * fewest_nodes)
         angles = np.asarray(period / n * np.arange(n), dtype=np.float64)
         return TableGrid(distances, angles, True, first, window)
-    n = max(math.ceil(span / _STEP_RAD) + 3, _FEWEST_NODES)
+    n = max(math.ceil(span / _STEP_RAD) + 3, fewest_nodes)
     angles = np.asarray(float(delta_rad[0]) + _STEP_RAD * (np.arange(n) - 1), dtype=np.float64)
     return TableGrid(distances, angles, False, first, window)
 
@@ -159,15 +157,16 @@ def build_table(
     shape = (len(signals), len(grid.distance_m), len(grid.delta_rad))
     signal = np.zeros((*shape, n_zones, window), np.float32)
     visible = np.zeros((*shape, len(planes), n_zones), np.float32)
+    coarse_m = 1.0  # shares of planes need no ranges: cells of a floor are not cut
     if background is not None:
-        whole = plane_light(ViewSignals(None, sensor), background, bearing_rad, _COARSE_M).sum(axis=-1)
+        whole = plane_light(ViewSignals(None, sensor), background, bearing_rad, coarse_m).sum(axis=-1)
     for c, one in enumerate(signals):
         for i, (distance_m, first) in enumerate(zip(grid.distance_m, grid.first_bin.tolist(), strict=True)):
             views = Views.broadcast(distance_m, grid.delta_rad, bearing_rad)
             if background is None:
                 counts = one.counts(views, workers)
             else:
-                found = one.surfaces(views, background, workers, finest_m=_COARSE_M)
+                found = one.surfaces(views, background, workers, finest_m=coarse_m)
                 counts, visible[c, i] = found[:, 0], found[:, planes].sum(axis=-1) / np.maximum(whole, 1e-300)
             low, high = max(first, 0), min(first + window, bins)
             signal[c, i, :, :, low - first : high - first] = counts[:, :, low:high]

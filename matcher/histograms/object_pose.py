@@ -24,7 +24,6 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 _MOST_STEPS = 12
 _DONE = 1e-4  # squared standard deviations: what is left of a search that converges quadratically is far less
 _SHARES = (1.0, 1 / 3, 1 / 9)
-_MOST_SUPPORT = 20.0
 _LARGEST_STEP = {"m": 0.02, "rad": 0.15}
 _WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
 
@@ -310,7 +309,8 @@ class _Supposed(NamedTuple):
     def moved(self, step: NDArray[np.float64]) -> _Supposed:
         step_of = dict(zip(self.free, step.tolist(), strict=True))
         values, ratio = displaced(self.displacement, self.support, step_of)
-        return self.at(values, min(max(ratio, self.support / 3), 3 * self.support, _MOST_SUPPORT))
+        most_support = 20.0
+        return self.at(values, min(max(ratio, self.support / 3), 3 * self.support, most_support))
 
 
 def _by_sensor(

@@ -21,7 +21,6 @@ from phasemark.render.kernel import kernel
 LEAST_COUNT = 1e-3
 """No bin is expected to count less: what a model gets wrong must not become infinitely improbable."""
 _LOWEST, _HIGHEST, _PER_DECADE = -3.0, 4.0, 40
-_BARE_STEPS = 4
 
 
 @lru_cache(maxsize=1)
@@ -201,7 +200,8 @@ def bare_deviance(counts: NDArray[np.float64], extra: NDArray[np.float64], cycle
     if not math.isinf(cycles):
         total = -cycles * np.log1p(-np.minimum(total / cycles, 0.999999))
     ambient = np.maximum((total - extra.sum()) / counts.shape[1], LEAST_COUNT)
-    for _ in range(_BARE_STEPS):
+    bare_steps = 4
+    for _ in range(bare_steps):
         sums = sums_of_frame(counts, np.zeros(counts.shape), np.empty((0, *counts.shape)), 1.0, ambient, extra, cycles)
         ambient_step(sums.own, np.zeros(1), ambient)
     return sums.deviance

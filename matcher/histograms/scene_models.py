@@ -22,10 +22,8 @@ WALL, FLOOR = 1, 2
 """Where planes stand among the surfaces of a scene; the landmark is 0."""
 FAINTEST, STRONGEST = 1e-2, 1e2
 """Brightness of a plane over that of the landmark, both over what their albedos say, between which it is looked for."""
-_LONGEST_SCALE = 1.0
 WALL_STEP_M = 2e-3
 """Half the distance of the two walls whose difference is a slope."""
-_LONGEST_WALL_STEP_M = 0.04
 _RATIO = np.array([[0.1], [10.0], [1.0]])
 """Brightness in a frame over that in the first one: limits, and longest step."""
 
@@ -73,9 +71,11 @@ class LandmarkModel(SceneModel):
         self.planes = planes_of(background)
         # planes alone: the first one's brightness is that of the scene
         self._brightest, *self._scaled = (0, *self.planes) if len(signals.vertices) or not self.planes else self.planes
-        limits = [(FAINTEST, STRONGEST, _LONGEST_SCALE)] * len(self._scaled)
+        longest_scale = 1.0
+        limits = [(FAINTEST, STRONGEST, longest_scale)] * len(self._scaled)
         if free_wall is not None:
-            limits.append((*free_wall, _LONGEST_WALL_STEP_M))
+            longest_wall_step_m = 0.04
+            limits.append((*free_wall, longest_wall_step_m))
         self.nuisances = np.array(limits).reshape(-1, 3).T
 
     def look(self, views: Views, extra: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -20,12 +20,9 @@ DESCENT_MARGIN = 100.0
 """A descent that cannot come within this of the best one is given up."""
 DIMMEST, BRIGHTEST = 0.1, 10.0
 """Brightness of a landmark over that of its bank between which it is looked for."""
-_TRIMS = 5
-_TRIM_SIGMA = 3.0
 _STEPS = 8
 _HALVINGS = 3
 _DONE = 0.05  # of a standard deviation
-_HOPE = 4.0  # the most that can still be gained, over the gain that a step promises
 _ROUNDS = 6
 """Of a descent that varies one brightness after another."""
 _MOST = 3
@@ -59,8 +56,10 @@ def ambient_light(counts: NDArray[np.float64], extra: NDArray[np.float64]) -> ND
     net = counts - extra
     use = np.ones(net.shape, bool)
     level = net.mean(axis=1)
-    for _ in range(_TRIMS):
-        use = net <= (level + _TRIM_SIGMA * np.sqrt(np.maximum(level, 1.0)))[:, None]
+    trims = 5
+    trim_sigma = 3.0
+    for _ in range(trims):
+        use = net <= (level + trim_sigma * np.sqrt(np.maximum(level, 1.0)))[:, None]
         level = np.where(use, net, 0.0).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
     return np.asarray(np.maximum(level, LEAST_COUNT), dtype=np.float64)
 
@@ -258,6 +257,7 @@ def _descend(  # type: ignore[no-untyped-def]
     at_m, at_rad, at_bright = place[0], place[1], bright
     d_m, d_rad, d_bright, shrink = 0.0, 0.0, 0.0, 1.0
     steps, halvings = 0, 0
+    hope = 4.0  # the most that can still be gained, over the gain that a step promises
     while steps < _STEPS:
         try_m = min(max(at_m + shrink * d_m, low_m), high_m)
         try_rad = at_rad + shrink * d_rad
@@ -311,7 +311,7 @@ def _descend(  # type: ignore[no-untyped-def]
         d_rad = (y1 - l21 * d_bright) / l11
         d_m = (y0 - l10 * d_rad - l20 * d_bright) / l00
         gain = y0 * y0 + y1 * y1 + y2 * y2
-        if gain < _DONE * _DONE or (steps > 1 and cost - _HOPE * gain > limit):
+        if gain < _DONE * _DONE or (steps > 1 and cost - hope * gain > limit):
             break
         longest = max(abs(d_m) / table.grid[1], abs(d_rad) / table.grid[3], 2 * abs(d_bright), 1.0)
         d_m, d_rad, d_bright = d_m / longest, d_rad / longest, d_bright / longest

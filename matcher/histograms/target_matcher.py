@@ -37,9 +37,6 @@ from phasemark.render.direct.targets import Status, Targets
 from phasemark.render.direct.view_signals import STEPS, views_about
 from phasemark.render.view import VIEW_FIELDS
 
-_GRID_STD_M = 0.01
-"""How far a target may be off between nodes of the table: added to sigmas in the search alone."""
-_MOST_STARTS = 9
 _ASIDE_RAD = math.radians(6.0)
 _WORTH_ANOTHER_TRY = 2 * DISAGREEMENT
 _STEPS, _SHARES = 6, (1.0, 0.3)
@@ -219,13 +216,16 @@ class TargetMatcher(DirectMatcher):
         distance, sure = self.table
         cost, shift = np.empty(distance.shape[:3]), np.empty(distance.shape[:3])
         step = float(self.grid.distance_m[1] - self.grid.distance_m[0])
-        variance = frame.std_m**2 + _GRID_STD_M**2
+        # how far a target may be off between nodes of the table: added to sigmas in the search alone
+        grid_std_m = 0.01
+        variance = frame.std_m**2 + grid_std_m**2
         node_costs(distance, sure, frame.zone, frame.distance_m, 1 / variance, frame.n_frames, step,
                    self._still, np.empty(len(frame.zone)), np.empty(len(frame.zone)), np.empty(distance.shape[3:]),
                    cost, shift)  # fmt: skip
         nodes = [(c, *node) for c in range(len(cost)) for node in grid_minima(cost[c], self.grid.cyclic)]
         starts = []
-        for c, i, j in sorted(nodes, key=lambda node: float(cost[node]))[:_MOST_STARTS]:
+        most_starts = 9
+        for c, i, j in sorted(nodes, key=lambda node: float(cost[node]))[:most_starts]:
             view = np.array([self.grid.distance_m[i] + shift[c, i, j], self.grid.delta_rad[j], 0.0, 0.0, 0.0, 0.0])
             starts.append((c, np.clip(view, *self.limits)))
         return starts

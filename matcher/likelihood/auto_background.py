@@ -31,14 +31,8 @@ __all__ = ["AutoBackground"]
 
 _WALLS_BEYOND_M = 0.5, 1.0, 2.0, 4.0
 """Distances behind the landmark at which a wall is tried where no pixel sees the background alone."""
-_BACKGROUND_ROUNDS = 4
-"""How often background and views are fitted in turn."""
-_OTHER_ANGLES = 12
-"""Angles that a frame before an estimated background is tried from where nothing else fits."""
 
 
-_TOGETHER = 8
-"""Frames whose backgrounds are in images of the bank at the same time: these take some megabytes each."""
 _SceneOf = Callable[[Sequence[Background]], Scene]
 _Standing = tuple[list[Background | None], Fits]
 """What stands behind the landmark in each of n frames, and their fits before it."""
@@ -93,7 +87,9 @@ class AutoBackground:
         backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
         # 3  search all pixels where that leaves a doubt: what was taken for background may be landmark
         which = self._doubtful(backgrounds, fits)
-        few = [which[start : start + _TOGETHER] for start in range(0, len(which), _TOGETHER)]
+        # frames whose backgrounds are in images of the bank at the same time: these take some megabytes each
+        together = 8
+        few = [which[start : start + together] for start in range(0, len(which), together)]
         fits = Fits.joined([fits, *(self._searched_together(some, backgrounds) for some in few)])
         which = self._doubtful(backgrounds, fits)
         backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
@@ -162,7 +158,7 @@ class AutoBackground:
             return fits[:0]
         own = _of_frames(fits, which)
         best = best_of_frame(own)
-        n = _OTHER_ANGLES
+        n = 12  # angles that a frame before an estimated background is tried from where nothing else fits
         source = np.repeat(best, n - 1)
         period = np.array([delta_period_rad(self._setup.rules.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
@@ -198,7 +194,8 @@ class AutoBackground:
     def _in_turn(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> _Standing:
         """Fit the background of each frame behind its best view, then the views before it, while that helps."""
         found: _Standing = backgrounds, fits
-        for _ in range(_BACKGROUND_ROUNDS):
+        background_rounds = 4  # how often background and views are fitted in turn
+        for _ in range(background_rounds):
             which, moved, starts = self._moved_backgrounds(which, *found)
             if not which.size:
                 break

@@ -35,15 +35,9 @@ _HEIGHTS = 256
 """Most heights at which a floor is tried."""
 _BACKGROUND_STEP_M = 1e-3
 """Width of a difference between two places of a wall or floor."""
-_BACKGROUND_STEPS = 30
-_PLANE_ROUNDS = 5
-_BACKGROUND_SETTLED = 0.1
-"""A step that promises to lower the whitened squared residual by less than this is not taken."""
 _LONGEST_STEP = 3.0
 _VIEW_SCALE = tuple(NATURAL_UNITS[name] for name in VIEW)
 """Natural units of the view."""
-_PLACE_SCALE_M = 0.1
-"""Natural unit of the places of wall and floor."""
 _FIRST_DAMPING, _LEAST_DAMPING, _HOPELESS_DAMPING = 1e-3, 1e-9, 1e5
 _USUAL_ALBEDO = 0.5
 
@@ -180,7 +174,8 @@ def _slope_of(height: NDArray[np.float64], place: NDArray[np.float64]) -> NDArra
     """Return what a plane through heights at places (2, n) rises from below the lens to each of them."""
     columns = np.column_stack([np.ones(len(height)), *place])
     weight = np.ones(len(height))
-    for _ in range(_PLANE_ROUNDS):  # towards the least sum of absolute residuals: pixels that are mixed are few
+    plane_rounds = 5
+    for _ in range(plane_rounds):  # towards the least sum of absolute residuals: pixels that are mixed are few
         root = np.sqrt(weight)
         found = np.linalg.lstsq(columns * root[:, None], height * root, rcond=None)[0]
         away = np.abs(height - columns @ found)
@@ -219,7 +214,8 @@ def fit_background(
     """
     names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
     columns = [VIEW.index(name) for name in free]
-    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([_PLACE_SCALE_M] * len(names))])
+    place_scale_m = 0.1  # natural unit of the places of wall and floor
+    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([place_scale_m] * len(names))])
 
     def moved(place: NDArray[np.float64]) -> Background:
         return replace(background, **dict(zip(names, place.tolist(), strict=True)))
@@ -230,7 +226,10 @@ def fit_background(
 
     at, place = view.copy(), np.array([getattr(background, name) for name in names], np.float64)
     sums, damping = sums_at(at, place), _FIRST_DAMPING
-    for _ in range(_BACKGROUND_STEPS):
+    background_steps = 30
+    # A step that promises to lower the whitened squared residual by less than this is not taken.
+    background_settled = 0.1
+    for _ in range(background_steps):
         if sums is None:
             break
         information = sums.information[0] * np.outer(scale, scale)
@@ -238,7 +237,7 @@ def fit_background(
         step = np.linalg.solve(held, sums.gradient[0] * scale)
         step *= min(1.0, _LONGEST_STEP / max(float(np.abs(step).max()), 1e-12))
         promise = float(sums.gradient[0] @ (step * scale))
-        if promise < _BACKGROUND_SETTLED:
+        if promise < background_settled:
             break
         there = at.copy()
         there[columns] += (step * scale)[: len(columns)]

@@ -25,13 +25,9 @@ from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages
 
-_FAINT = 1e-5
-"""Coverages this close to 0 or 1 count as 0 or 1."""
 _STRAIGHT = 2e-3
 """Second difference of a pixel's brightness, over the brightest, that a smooth change may have, the inverse square of
 the distance taken out; an edge that comes in changes it by some hundredths."""
-_DIM = 0.05
-"""Where a neighbour is dimmer than this share of the brightest one, interpolate linearly."""
 
 
 class BankModel(ImageModel):
@@ -112,7 +108,8 @@ class BankModel(ImageModel):
         low, high, bend = np.empty((3, len(view), self._sensor.rows * self._sensor.cols))
         _extremes(class_index, view, *self._grid(), self._stacks, low, high)
         _bends(class_index, view, *self._grid(), self._stacks, bend)
-        inside = (high < _FAINT) | (low > 1 - _FAINT) | ((low > _FAINT) & (high < 1 - _FAINT))
+        faint = 1e-5  # coverages this close to 0 or 1 count as 0 or 1
+        inside = (high < faint) | (low > 1 - faint) | ((low > faint) & (high < 1 - faint))
         return inside & (bend < _STRAIGHT)
 
     def limits(self) -> tuple[float, float]:
@@ -285,9 +282,10 @@ def _between(n, b00, b01, b10, b11, d, a, step_d, step_a, straight, with_slopes)
 def _conclude(m, n, pixel, first, cubic, straight, behind, behind_intensity, phasor, slope, shade):  # type: ignore[no-untyped-def]
     """Choose for each of n pixels between cubic and straight, put the background behind it, and store it."""
     with_slopes = slope.shape[1] > 0
+    dim = 0.05  # where a neighbour is dimmer than this share of the brightest one, interpolate linearly
     for q in range(n):
         at = first + pixel[q]
-        chosen = cubic if cubic[9, q] > _DIM * _DIM * cubic[10, q] else straight
+        chosen = cubic if cubic[9, q] > dim * dim * cubic[10, q] else straight
         phasor[m, at] = complex(chosen[0, q], chosen[3, q])
         shade[m, 0, at], shade[m, 1, at] = straight[9, q], straight[6, q]
         if len(behind):

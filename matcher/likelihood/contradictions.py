@@ -21,14 +21,9 @@ from phasemark.matcher.pixel_agreement import (
 
 _SIZES = -3.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 3.0
 """Where views are tried that may excuse pixels, in standard deviations along the axes of the covariance."""
-_EXCUSE_ROUNDS = 2
-_SHOWN_OUTLINE = 0.25
-"""Share of the outline in view that a frame must show."""
 _SEEN_THROUGH, _BESIDE_A_SLAB = 0.1, 0.5
 """Pixels that may see something behind the landmark, over those that agree with it; the second where no outline is in
 view: a landmark may be modelled wider than it is, as a slab that fills the view, to leave its edges open."""
-_SURFACE_M = 0.01
-"""What continues a surface lies this near its tangent plane, noise apart; three times as far from a single pixel."""
 
 
 def contradicted_pixels(
@@ -77,7 +72,8 @@ def _fewest_wrong(
     offset, cost = np.zeros((k, p)), DISAGREEMENT * wrong.sum(axis=1)
     source, own = np.repeat(near, len(moves)), np.repeat(np.arange(k), len(moves))
     around = problem.around(source)
-    for _ in range(_EXCUSE_ROUNDS):
+    excuse_rounds = 2
+    for _ in range(excuse_rounds):
         tried = (offset[:, None] + moves).reshape(-1, p)
         view = state.theta[source, :ALBEDO_COLUMN]
         view[:, problem.columns[:p]] += np.einsum("npa,na->np", axes[own], tried)
@@ -155,6 +151,8 @@ def _ends_at_outline(problem: Problem, state: State, agreeing: NDArray[np.bool_]
     inside, outside = agreeing.reshape(shape) & (coverage > MUST_RETURN_COVERAGE), coverage < MAY_RETURN_COVERAGE
     filled = inside & (coverage >= FILLED_COVERAGE)
     counted = np.zeros((3, len(coverage)), np.int64)
+    # what continues a surface lies this near its tangent plane, noise apart; three times as far from a single pixel
+    surface_m = 0.01
     for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
 
         def at(values: NDArray[Any], k: int, axis: int = axis, step: int = step) -> NDArray[Any]:
@@ -167,9 +165,10 @@ def _ends_at_outline(problem: Problem, state: State, agreeing: NDArray[np.bool_]
         for k, first in ((1, at(outside, 1)), (2, at(outside, 2) & ~at(outside, 1))):
             extended = 1 / np.maximum(1 / z + k * rise, 1e-3)
             lever = np.where(has_slope, (k + 1) ** 2 + k**2, 1)
-            near = np.where(has_slope, 1, 3) * _SURFACE_M + 5 * np.sqrt(at(variance, k) + lever * variance)
+            near = np.where(has_slope, 1, 3) * surface_m + 5 * np.sqrt(at(variance, k) + lever * variance)
             pair, back, off = inside & first, at(returned, k), at(z, k) - extended
             ends, continues = pair & (at(absent, k) | (back & (off > near))), pair & back & (np.abs(off) <= near)
             counted += np.array([one.sum(axis=(1, 2)) for one in (pair, ends, continues)])
     pairs, ends_at, continues_at = counted
-    return np.asarray((ends_at >= continues_at) & (ends_at >= _SHOWN_OUTLINE * pairs))
+    shown_outline = 0.25  # share of the outline in view that a frame must show
+    return np.asarray((ends_at >= continues_at) & (ends_at >= shown_outline * pairs))

@@ -21,24 +21,11 @@ from phasemark.matcher.likelihood.uncertainty import capped_axes, view_covarianc
 SETTLED_COST, ROUGH_COST = 1e-3, 0.1
 """A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as much
 was the last; the second for first comparisons of minima."""
-_KEPT_SLOPES_COST = 30.0
-"""Where a step promises less than this, slopes rendered before serve again, until a step with them fails."""
-_OPTIMISM = 3.0
-"""A descent gives up where even this many times the promised decrease would not save it."""
 
 _FIRST_DAMPING = 1e-3
 _HOPELESS_DAMPING = 1e5
-_LAST_PROMISE = 100.0
-"""A descent ends after a successful step that promised a decrease below this many times `settled`: convergence is
-quadratic."""
 CLOSE_BY_RAD = tuple(math.radians(angle) for angle in (-0.7, -0.28, -0.12, 0.12, 0.28, 0.7))
 """Offsets of δ at which a solution before a background or on phasors is compared with a parabola."""
-_PARABOLA_SHARE = 0.5
-"""A cost there below this share of the parabola's shows another minimum."""
-_PROMISING_COST = 20.0
-"""What a view beside a solution may cost more and still lead to a better one."""
-_SETTLING_ROUNDS = 3
-"""How often a view that contradicts some pixels is left for a better one nearby."""
 _SETTLING_SIGMA = -5.0, -2.5, -1.5, -1.0, -0.5, -0.25, 0.25, 0.5, 1.0, 1.5, 2.5, 5.0
 """Where those are looked for, in standard deviations along the axes of the covariance."""
 
@@ -53,12 +40,18 @@ def descend(problem: Problem, state: State, settled: float) -> State:
     slopes_are_old = np.zeros(len(state.theta), np.bool_)
     reach = np.full(len(state.theta), problem.settings.longest_step)
     active = np.arange(len(state.theta))
+    # where a step promises less than this, slopes rendered before serve again, until a step with them fails
+    kept_slopes_cost = 30.0
+    optimism = 3.0  # A descent gives up where even this many times the promised decrease would not save it.
+    # A descent ends after a successful step that promised a decrease below this many times `settled`: convergence is
+    # quadratic.
+    last_promise = 100.0
     for _ in range(problem.policy.max_iterations):
         sums = state.sums
         step, limited = _steps(problem, sums.information[active], sums.gradient[active], damping[active], reach[active])
         # the predicted decrease: stop where it is negligible, or where several times it stays above the limit
         promise = np.einsum("mp,mp->m", sums.gradient[active], step)
-        worth = (promise > settled) & (sums.cost[active] - _OPTIMISM * promise < problem.limit[active])
+        worth = (promise > settled) & (sums.cost[active] - optimism * promise < problem.limit[active])
         active, step, promise, limited = active[worth], step[worth], promise[worth], limited[worth]
         if not active.size:
             break
@@ -66,7 +59,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
         theta[:, problem.columns] += step
         theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], active)
         theta[:, ALBEDO_COLUMN] = np.maximum(theta[:, ALBEDO_COLUMN], 1e-3)
-        promises_little = promise < _KEPT_SLOPES_COST
+        promises_little = promise < kept_slopes_cost
         goes_on = np.ones(len(active), np.bool_)
         for which, with_slopes in ((np.flatnonzero(~promises_little), True), (np.flatnonzero(promises_little), False)):
             if not which.size:
@@ -75,7 +68,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
             slope = None if with_slopes else state.images.slope[tried]
             there = problem.some(tried).state(theta[which], state.use[tried], slope)
             better = there.sums.cost <= state.sums.cost[tried]
-            goes_on[which] = (promise[which] > _LAST_PROMISE * settled) | ~better
+            goes_on[which] = (promise[which] > last_promise * settled) | ~better
             damping[tried] = np.where(better, np.maximum(damping[tried] * 0.1, 1e-9), damping[tried] * 8)
             # who still has far to go after a step that was cut short may step further, until one fails
             farther = np.minimum(2 * reach[tried], LONGEST_STEP)
@@ -140,9 +133,11 @@ def look_beside(problem: Problem, state: State) -> State:
     rise -= state.sums.cost[near, None]
     # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
     expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state))[near, d][:, None]
-    best = np.argmin(rise - _PARABOLA_SHARE * expected_rise, axis=1)
+    parabola_share = 0.5  # A cost there below this share of the parabola's shows another minimum.
+    best = np.argmin(rise - parabola_share * expected_rise, axis=1)
     parabola = np.take_along_axis(expected_rise, best[:, None], axis=1)[:, 0]
-    most = np.minimum(_PROMISING_COST, _PARABOLA_SHARE * parabola)
+    promising_cost = 20.0  # what a view beside a solution may cost more and still lead to a better one
+    most = np.minimum(promising_cost, parabola_share * parabola)
     chosen = np.flatnonzero(np.take_along_axis(rise, best[:, None], axis=1)[:, 0] < most)
     if not chosen.size:
         return state
@@ -165,7 +160,8 @@ def settle(problem: Problem, state: State) -> State:
     """
     cost, contradicted = whole_cost(problem, state)
     near = problem.near_best(state, problem.policy.close_cost)
-    for _ in range(_SETTLING_ROUNDS):
+    settling_rounds = 3  # how often a view that contradicts some pixels is left for a better one nearby
+    for _ in range(settling_rounds):
         near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]))]
         if not near.size:
             break

@@ -58,8 +58,6 @@ the solution."""
 _FEWEST_PER_PARAMETER, _FURTHER_ZONES = 6, 3
 """Returns that each free parameter takes among unknown things or outliers; zones of a chip, which are few but show one
 surface each, that an answer explains beyond its number of free parameters."""
-_AGAINST_FAR_VIEW = 4
-"""Unexplained pixels that must stand against a far view of the same landmark among unknown things; of zones, one."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
@@ -115,10 +113,12 @@ class LikelihoodMatcher:
         rules = Rules.of_bank(bank, names, false_alarm, tolerance_m, tolerance_rad)
         if reported and has_prior:  # pitch and roll are free because no mounting is level, and not to be found
             rules = replace(rules, tolerance={**rules.tolerance, **dict.fromkeys(VIEW[4:], math.inf)})
+        # unexplained pixels that must stand against a far view of the same landmark among unknown things; of zones, one
+        against_far_view = 4
         rules = replace(
             rules,
             among_unknown=unknown,
-            rival_cost=DISAGREEMENT * (_AGAINST_FAR_VIEW if unknown and not reported else 1),
+            rival_cost=DISAGREEMENT * (against_far_view if unknown and not reported else 1),
             fewest_explained=0 if huber is None else fewest,
         )
         self._setup = Setup(

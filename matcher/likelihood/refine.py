@@ -32,12 +32,6 @@ from phasemark.matcher.likelihood.uncertainty import (
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE, beside
 
-_AXIS_ROUNDS = 3
-"""How often slopes are differenced along the axes of the covariance, which they make in turn, where height, pitch or
-roll is free."""
-_RECOUNT_COST = 25.0
-"""Cost by which a view may grow, contradicted pixels included, after deciding again which pixels count."""
-
 _PIXELS_AT_ONCE = 1 << 20
 """Of all candidates that are refined roughly together: their images with slopes take some hundred bytes a pixel."""
 _VIEWS_AT_ONCE = 512
@@ -182,8 +176,10 @@ def _recounted(problem: Problem, state: State) -> State:
         again = problem.some(changed)
         before = whole_cost(again, picked(state, changed))[0]
         moved = descend(again, again.state(state.theta[changed], use[changed]), SETTLED_COST)
+        # cost by which a view may grow, contradicted pixels included, after deciding again which pixels count
+        recount_cost = 25.0
         # pixels that no longer count may hold a view no longer: it would slide to where they are contradicted
-        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + _RECOUNT_COST)
+        better = np.flatnonzero(whole_cost(again, moved)[0] <= before + recount_cost)
         state.update(changed[better], picked(moved, better))
     return state
 
@@ -260,7 +256,10 @@ def _uncertainty(
     without_one = np.full((len(state.theta), len(problem.settings.free)), np.inf)
     if near.size:
         there = problem.some(near)
-        for _ in range(_AXIS_ROUNDS if problem.height_or_tilt_is_free else 1):
+        # how often slopes are differenced along the axes of the covariance, which they make in turn, where height,
+        # pitch or roll is free
+        axis_rounds = 3
+        for _ in range(axis_rounds if problem.height_or_tilt_is_free else 1):
             if problem.height_or_tilt_is_free:
                 wide: NDArray[np.complex128] | None = slopes_along_axes(there, state, near, covariance[near])
             else:

@@ -23,8 +23,6 @@ STEP = 1e-5
 """Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
 _BEFORE_LENS_M, _BEFORE_WALL_M = 5e-3, 1e-3
 """Smallest gaps between the circle around a landmark and the lens, and the wall."""
-_BEYOND_BANK = 1.25
-"""Without a wall a view may be this many times as far as the bank's last distance."""
 
 
 class RenderedModel(ImageModel):
@@ -80,7 +78,8 @@ class RenderedModel(ImageModel):
     def _farthest_before(self, background: Background | None) -> float:
         """Return how far a landmark may be: before the wall."""
         wall = None if background is None else background.wall_m
-        return _BEYOND_BANK * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
+        beyond_bank = 1.25  # without a wall a view may be this many times as far as the bank's last distance
+        return beyond_bank * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
 
     def renderer(self, class_index: int) -> Renderer:
         """Return what renders one class of the bank."""

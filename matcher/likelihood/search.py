@@ -36,25 +36,14 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 
 __all__ = ["are_doubtful", "fit_views", "search_views"]
 
-_REFUSED_P = 0.01
-"""p-value at which views around the best fits are tried too."""
 
-
-_MANY_STARTS = 30
-"""Starts of a frame that take longer than cells before its own background."""
 _SLACK = 8 * DISAGREEMENT
 """Cost by which a scout in the middle of a cell may be above a view of it, among the few zones of a chip, and by which
 the bound of another cell may be below that of the right one, whose views are level."""
-_STARTS_AT_ONCE = 4096
-"""Starts that are refined together, but for those of one frame: each has an image of it."""
 _STEP_AFTER_SCOUT = 0.1, 1.0
 """Longest step, in natural units, of a descent before a background or on phasors that starts where a scout ended, and
 of others after a scout. Near a solution it is short: where an edge crosses a pixel's border, slopes jump."""
 
-_SOFT_M = 0.01
-"""Standard deviation of ranges that is added for the first steps of a robust descent: half a cell."""
-_SCOUT_PIXELS = 0.05
-"""Standard deviation of ranges that is added for a scout made of strips, in widths of a pixel at 1 m: its own error."""
 _APART, _APART_COLUMNS = (0.01, math.radians(2.0)), 0.25
 """Distance and angle, and columns of bearing, within which minima of that scout lead to one."""
 _BEST_BESIDE = 2
@@ -89,8 +78,9 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
     starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
     fits = fit_starts(scene, evidence, which, starts, _most(setup, evidence[which]))
+    refused_p = 0.01  # p-value at which views around the best fits are tried too
     # 5  where nothing fits, look around the best fits
-    poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), _REFUSED_P))
+    poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), refused_p))
     if poor.size:
         fits = Fits.joined([fits, fit_neighbouring_views(scene, evidence, poor, fits)])
     # 6  where the best fit would be accepted, look for rivals in all cells that are left
@@ -151,7 +141,8 @@ def _closed(
 ) -> Starts:
     """Return starts, those of frames with many of them from cells before their own backgrounds, all pixels compared."""
     parts = [starts.of_frames(np.array([k])) for k in range(len(which))]
-    for k in np.flatnonzero(np.bincount(starts.frame, minlength=len(which)) > _MANY_STARTS):
+    many_starts = 30  # starts of a frame that take longer than cells before its own background
+    for k in np.flatnonzero(np.bincount(starts.frame, minlength=len(which)) > many_starts):
         own = which[k : k + 1]
         parts[k] = search_of(int(own[0])).uncovered(seen[own], limit[[k]], [places[int(k)]])
     return Starts.joined(parts)
@@ -160,7 +151,8 @@ def _closed(
 def _in_parts(starts: Starts, n: int) -> Iterator[NDArray[np.int64]]:
     """Yield those of n frames that have starts, a few at a time."""
     count = np.bincount(starts.frame, minlength=n)
-    part = np.cumsum(count) // _STARTS_AT_ONCE
+    starts_at_once = 4096  # starts that are refined together, but for those of one frame: each has an image of it
+    part = np.cumsum(count) // starts_at_once
     for number in np.unique(part[count > 0]):
         yield np.flatnonzero((part == number) & (count > 0))
 
@@ -258,7 +250,9 @@ def _on_scout(scene: Scene, evidence: Evidence) -> Evidence:
     """Return frames with the errors of a scout made of strips, if there is one."""
     if scene.strips is None:
         return evidence
-    return evidence.with_further_noise(_SCOUT_PIXELS * scene.setup.bank.sensor.pixel_rad)
+    # standard deviation of ranges that is added for a scout made of strips, in widths of a pixel at 1 m: its own error
+    scout_pixels = 0.05
+    return evidence.with_further_noise(scout_pixels * scene.setup.bank.sensor.pixel_rad)
 
 
 def _spread(scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -303,8 +297,10 @@ def _descended(scene: Scene, evidence: Evidence, starts: Starts, known: Fits | N
     """Refine starts roughly, on the scout if there is one; leave out those at known places."""
     settings, model = scene.settings(), scene.scout or scene.final
     if scene.setup.huber is not None:
+        # standard deviation of ranges that is added for the first steps of a robust descent: half a cell
+        soft_m = 0.01
         # a loss that stays constant for outliers has no slope a cell away: the first steps have more noise
-        soft = evidence.with_further_noise(_SOFT_M)
+        soft = evidence.with_further_noise(soft_m)
         starts = replace(starts, view=refine(model, soft, starts, settings, roughly=True).view)
     fits = refine(model, evidence, starts, settings, roughly=True)
     if known is None:

@@ -46,10 +46,6 @@ _STEPS = {
 _LENS_STEP_RAD = math.radians(0.02)
 """How far the width of a difference in a term of the lens moves the point of an image that it moves most."""
 _OFFSET = "range_offset_m"
-_REACH_S = 0.25
-"""Estimates farther away in time do not tell how fast a view changes."""
-_RATE_NEEDS = 3
-"""Estimates that a rate takes, the view's own among them."""
 
 
 def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
@@ -217,10 +213,12 @@ def rates_of_views(
     """
     known = np.isfinite(view).all(axis=1) & np.isfinite(std).all(axis=1)
     rate = np.zeros_like(view)
+    reach_s = 0.25  # estimates farther away in time do not tell how fast a view changes
+    rate_needs = 3  # estimates that a rate takes, the view's own among them
     for k in np.flatnonzero(known):
-        near = np.flatnonzero(known & (np.abs(time_s - time_s[k]) <= _REACH_S))
+        near = np.flatnonzero(known & (np.abs(time_s - time_s[k]) <= reach_s))
         since = time_s[near] - time_s[k]
-        if len(near) < _RATE_NEEDS or np.ptp(since) == 0:
+        if len(near) < rate_needs or np.ptp(since) == 0:
             continue
         away = view[near] - view[k]
         away[:, turn] = (away[:, turn] + period_rad[k] / 2) % period_rad[k] - period_rad[k] / 2

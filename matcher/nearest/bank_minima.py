@@ -30,18 +30,10 @@ Known = tuple[NDArray[np.int64], NDArray[np.float64]]
 CostOf = Callable[[int, NDArray[np.int64], NDArray[np.float64]], NDArray[np.float64]]
 """Returns the costs of a frame, which is counted from 0, at classes and views."""
 
-_MOST_UP = 4
-"""Number of shifts upwards, and downwards, that are compared."""
-_OFF_KINK_M = 0.002
-"""Heights start at this in place of 0, where the box's top appears and slopes of one side would hold them."""
 _N_MODES = 12
 """Local minima of the cells of one class that are refined, at most."""
 _CLOSE = 2, 2, 1
 """Cells, columns in the last place, within which a descent from one place stands for all: D, δ, bearing."""
-_MOST_TOLD = 512
-"""Cells of a class under a shift whose costs are told more exactly where a descent starts."""
-_RAISED = 3.0
-"""Factor by which the limit of a frame is raised that no view explains."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +101,9 @@ class Upward(NamedTuple):
             return 0.0, 0.0
         share = 1.0 if math.isinf(by_height) else by_height / whole
         height_m = distance_m * math.tan(share * elevation_rad)
-        return height_m or (_OFF_KINK_M if by_height else 0.0), (1 - share) * elevation_rad
+        # heights start at this in place of 0, where the box's top appears and slopes of one side would hold them
+        off_kink_m = 0.002
+        return height_m or (off_kink_m if by_height else 0.0), (1 - share) * elevation_rad
 
 
 class Search:
@@ -148,7 +142,8 @@ class Search:
         self._row_rad = 2 * math.atan(sensor.tan_half_angles[1]) / sensor.rows
         widest_up = upward.widest_rad(float(cells.distance_m[0]))
         highest = min(sensor.rows // 4, math.ceil(min(widest_up / self._row_rad, sensor.rows)))
-        stride_up = max(math.ceil(highest / _MOST_UP), 1)
+        most_up = 4  # number of shifts upwards, and downwards, that are compared
+        stride_up = max(math.ceil(highest / most_up), 1)
         highest -= highest % stride_up
         self._classes = range(cells.shape[0])
         self._neighbours = cells.closes, 2 * most + 1
@@ -184,10 +179,11 @@ class Search:
             cells tell them.
         """
         frames, found = _Moved(self, seen), []
+        raised = 3.0  # factor by which the limit of a frame is raised that no view explains
         for f in range(len(limit)):
             own = limit[f]
             while not np.isfinite(cost := frames.costs(f, own)).any():
-                own *= _RAISED
+                own *= raised
             if cost_of is not None:
                 cost[[up != 0 for up, _ in self.shifts]] = np.inf
                 self._tell(_least(cost), f, cost_of)
@@ -327,9 +323,10 @@ class _Moved:
 
 def _least(cost: NDArray[np.float32]) -> NDArray[np.float32]:
     """Set all costs (shift, class, D, δ) infinite but the least of each class under each shift; return them."""
+    most_told = 512  # cells of a class under a shift whose costs are told more exactly where a descent starts
     for own in cost.reshape(*cost.shape[:2], -1).reshape(-1, math.prod(cost.shape[2:])):
-        if len(own) > _MOST_TOLD:
-            own[own > np.partition(own, _MOST_TOLD)[_MOST_TOLD]] = np.inf
+        if len(own) > most_told:
+            own[own > np.partition(own, most_told)[most_told]] = np.inf
     return cost
 
 

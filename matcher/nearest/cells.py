@@ -34,9 +34,6 @@ _JUMP_M = 0.04
 """Ranges of a pixel that differ by more from node to node are those of two surfaces."""
 WIDE_PIXEL_RAD = math.radians(2.0)
 """Pixels wider than this show so much that the bank's images do not tell what they show a part of a pixel aside."""
-_FARTHER_IN = 0.2
-"""Half width of the interval of a wide pixel that an edge crosses, in widths of a pixel at its range: where the edge
-comes in farther, the pixel sees another part of a surface."""
 _WIDER = 1.25
 """Factor on the intervals: within a cell, ranges bend."""
 
@@ -249,7 +246,10 @@ def _intervals(
     half = np.zeros(ranges.shape)
     edge = coverage.reshape(ranges.shape) < FILLED_COVERAGE
     if bank.sensor.pixel_rad > WIDE_PIXEL_RAD:
-        half[edge] = _FARTHER_IN * bank.sensor.pixel_rad * np.abs(ranges[edge])
+        # half width of the interval of a wide pixel that an edge crosses, in widths of a pixel at its range: where the
+        # edge comes in farther, the pixel sees another part of a surface
+        farther_in = 0.2
+        half[edge] = farther_in * bank.sensor.pixel_rad * np.abs(ranges[edge])
     if seen.open_edges:
         half[edge], may = _FAR_M, may | edge
     return _Intervals(ranges, half, may, must).each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))

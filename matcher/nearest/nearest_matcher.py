@@ -26,8 +26,6 @@ from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 __all__ = ["NearestMatcher"]
 
 _FRAMES_AT_ONCE = 128
-_WORTH_A_LOOK = 4.0
-"""Ratio of costs on the grid up to which another minimum may, between grid points, explain a frame as well."""
 _Index = NDArray[np.int64]
 
 
@@ -150,6 +148,8 @@ class NearestMatcher:
         ambiguous = np.zeros(len(frames), np.bool_)
         best = np.argmin(found.cost, axis=1)
         n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
+        # ratio of costs on the grid up to which another minimum may, between grid points, explain a frame as well
+        worth_a_look = 4.0
         for c in range(len(self._bank.classes)):
             own = np.flatnonzero(which & (best == c))
             if not own.size:
@@ -158,7 +158,7 @@ class NearestMatcher:
             at, cost = (values[own] for values in found.minima[block])
             i, j = np.divmod(at - block * n_distance * n_delta, n_delta)
             # a grid point is off its minimum: how much a frame costs between points is known from the best one
-            near = cost < _WORTH_A_LOOK * (found.cost[own, c, None] + DISAGREEMENT)
+            near = cost < worth_a_look * (found.cost[own, c, None] + DISAGREEMENT)
             k, m = np.nonzero(near & self._far(c, i, j, found.i[own, c, None], found.j[own, c, None]))
             if not k.size:
                 continue

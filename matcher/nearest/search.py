@@ -26,8 +26,6 @@ _REACH_M, _REACH_RAD = 0.01, math.radians(5)
 _WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
 """The same before a background, where mixed pixels count and the ripples are wider."""
 _N_STARTS = 6
-_LEAST_THINNING = 4
-"""A grid that is thinned by less than this is searched whole."""
 
 
 class ExactSearch:
@@ -141,7 +139,8 @@ def nearest_search(
         stride = _at_least_one(_THIN_M / steps[0]), _at_least_one(_THIN_RAD / steps[1])
         far = (_WIDE_REACH_M, _WIDE_REACH_RAD) if before_background else (_REACH_M, _REACH_RAD)
         reach = _at_least_one(far[0] / steps[0]), _at_least_one(far[1] / steps[1])
-        if math.prod(stride) >= _LEAST_THINNING:
+        least_thinning = 4  # A grid that is thinned by less than this is searched whole.
+        if math.prod(stride) >= least_thinning:
             return PrunedSearch(templates, distance_m, delta_rad, stride, reach)
     n_delta = len(delta_rad)
     closes = steps[1] is not None and closing_period(delta_rad) is not None

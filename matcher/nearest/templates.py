@@ -33,7 +33,6 @@ from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_
 from phasemark.render.phasor_images import wrap_difference_m
 
 _T = TypeVar("_T", bound=np.generic)
-_RECHECKED = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +223,9 @@ class Templates:
         scale = float(np.sum(seen.weight[frame] * self.about(seen[frame : frame + 1])[0] ** 2))
         scale += float(np.abs(costs).min()) + DISAGREEMENT * seen.range_m.shape[1]
         near = np.flatnonzero(costs <= costs.min() + 1e-5 * scale)
-        if len(near) > _RECHECKED:
-            near = near[np.argpartition(costs[near], _RECHECKED)[:_RECHECKED]]
+        rechecked = 64
+        if len(near) > rechecked:
+            near = near[np.argpartition(costs[near], rechecked)[:rechecked]]
         exact = self.exact_costs(seen, frame, near + offset)
         k = int(exact.argmin())
         return int(near[k] + offset), float(exact[k])

@@ -12,10 +12,6 @@ from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 __all__ = ["distances_of_frames"]
 
-_PIXELS_ACROSS = 1.5
-"""A landmark that spans fewer pixels than this is not told: farther away the bank has no views."""
-_GAP_M = 0.02
-"""Smallest gap between the lens and the circle around a landmark."""
 _ROUNDED_M, _STEP_M = 0.1, 0.01
 """Distances end at multiples of this, so that other frames find the same bank; and the step between them."""
 
@@ -41,17 +37,20 @@ def distances_of_frames(frames: Frames, mesh: SurfaceMesh) -> tuple[float, ...]:
     if not ranges.size:
         raise UsageError("no pixel of the frames has a valid range: there is nothing to build a bank for")
     across_m = max(2 * radius_m, float(np.ptp(vertices[:, 2])))
-    told_m = across_m / (_PIXELS_ACROSS * frames.sensor.pixel_rad)
+    # A landmark that spans fewer pixels than this is not told: farther away the bank has no views.
+    pixels_across = 1.5
+    told_m = across_m / (pixels_across * frames.sensor.pixel_rad)
     nearest_m, farthest_m = float(np.min(ranges)), float(np.max(ranges))
-    start = max(radius_m + _GAP_M, nearest_m)
+    gap_m = 0.02  # smallest gap between the lens and the circle around a landmark
+    start = max(radius_m + gap_m, nearest_m)
     stop = min(farthest_m + radius_m, told_m)
     if radius_m > farthest_m or not start < stop:
         raise UsageError(
             f"a landmark of {across_m:.3g} m cannot be in these frames: their ranges are {nearest_m:.3g} …"
-            f" {farthest_m:.3g} m, and this camera tells it from {radius_m + _GAP_M:.3g} m to {told_m:.3g} m; check the"
+            f" {farthest_m:.3g} m, and this camera tells it from {radius_m + gap_m:.3g} m to {told_m:.3g} m; check the"
             " mesh's unit"
         )
-    first = max(math.floor(start / _ROUNDED_M) * _ROUNDED_M, math.ceil((radius_m + _GAP_M) / _STEP_M) * _STEP_M)
+    first = max(math.floor(start / _ROUNDED_M) * _ROUNDED_M, math.ceil((radius_m + gap_m) / _STEP_M) * _STEP_M)
     last = max(math.ceil(stop / _ROUNDED_M) * _ROUNDED_M, first + 2 * _ROUNDED_M)
     n = round((last - first) / _STEP_M) + 1
     return tuple(np.round(first + _STEP_M * np.arange(n), 4).tolist())

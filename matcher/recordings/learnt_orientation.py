@@ -26,8 +26,6 @@ from phasemark.render import Frames
 DECISIVE_ODDS = 1e4
 """Odds against an orientation from which it is excluded."""
 _MOST_ODDS = 1e3
-_AT_ONCE = 3
-"""Frames that are matched before orientations are given up that no further frame would bring back."""
 _UNEXPLAINED = ("no landmark", "poor fit", "outside the bank")
 
 
@@ -93,7 +91,8 @@ def learn_orientation(matcher: Matcher, frames: Frames, *, n_frames: int = 10) -
     doubt = log_odds = np.zeros(len(orientations))
     left, n_explained = np.arange(len(orientations)), 0
     fits: list[list[Match]] = [[] for _ in orientations]
-    rounds = math.ceil(len(chosen) / _AT_ONCE)
+    at_once = 3  # frames that are matched before orientations are given up that no further frame would bring back
+    rounds = math.ceil(len(chosen) / at_once)
     for start in range(rounds):
         some = filtered[start::rounds]
         matches = [list(matcher.match(some.with_pixels(orientations[k].apply))) for k in left]

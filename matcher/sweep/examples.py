@@ -19,9 +19,6 @@ from phasemark.matcher.sweep.result_tables import SweepTrials
 from phasemark.matcher.sweep.run import read_plan_of
 from phasemark.render import Frames
 
-_SIGMA = 1e-9
-"""Errors in units of a bound that is unknown come before all others."""
-
 
 def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> Frames:
     """Take the frames of one trial of a sweep again, bit for bit.
@@ -59,10 +56,11 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
 def example_trials(job: SweepJob, trials: SweepTrials, n: int, folder: Path) -> Iterator[dict[str, Any]]:
     """Yield entries of a page for each method: a trial of median error over its bound, and its n worst conditions."""
     error = trials.error
+    sigma = 1e-9  # errors in units of a bound that is unknown come before all others
     for m in range(len(trials.methods)):
         with np.errstate(invalid="ignore"):
             std = np.sqrt(np.einsum("npp->np", trials.bound[:, m]))[:, :2]
-            scaled = np.abs(error[:, m, :2]) / np.where(std > _SIGMA, std, _SIGMA)
+            scaled = np.abs(error[:, m, :2]) / np.where(std > sigma, std, sigma)
         badness = np.where(np.isfinite(scaled).all(axis=1), scaled.max(axis=1), np.inf)
         ranked = [int(k) for k in np.argsort(-badness, kind="stable") if trials.true_class[k] >= 0]
         if ranked:

@@ -78,10 +78,7 @@ STORED = ("condition", "trial", *(name for fields in _fields(0) for name, *_ in 
 """Names of all arrays that a file of trials holds."""
 _REFERENCE = Method(name="reference")
 """Maximum likelihood on ranges before a known background."""
-_CONFUSION_TRIALS = 4
-"""Views of a condition, which hardly differ, for which the bound on class confusion is computed."""
 _WIGGLES = (3, 5, 7)
-_RENDERERS_KEPT = 16
 
 
 @dataclass(frozen=True)
@@ -282,7 +279,8 @@ class SweepJob:
             if key not in self._renderers:
                 kind = Renderer if sensor.histogram is None else ChipRenderer
                 self._renderers[key] = kind(self._mesh(number, dimension_error), sensor, albedo=condition.albedo)
-                if len(self._renderers) > _RENDERERS_KEPT:
+                renderers_kept = 16
+                if len(self._renderers) > renderers_kept:
                     self._renderers.pop(next(iter(self._renderers)))
             return self._renderers[key].seen_by(sensor)
 
@@ -346,7 +344,9 @@ class SweepJob:
         distance of 100 the matcher does not follow a class; it then counts as that far away, which adds 3e-7.
         """
         found = np.full(len(views), np.nan)
-        n = min(len(views), _CONFUSION_TRIALS - first)
+        # views of a condition, which hardly differ, for which the bound on class confusion is computed
+        confusion_trials = 4
+        n = min(len(views), confusion_trials - first)
         if n <= 0 or self.is_stranger(number):
             return found
         if len(self.class_names) == 1:

@@ -36,9 +36,6 @@ from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, 
 from phasemark.render.figures import RANGE_COLOURS, draw_range, landmark_limits_m
 from phasemark.render.integral.rounding import with_interval
 
-_MOST_ROWS = 80
-_READABLE_IN = 6.5
-"""Wider figures keep their size on a phone, to be moved about."""
 _MOST_EXAMPLES = 8
 _SEEN, _EXAMPLES, _AGAIN = "What the camera sees", "Typical and worst trials", "Make this page again"
 VIEW_HEADER = ("D (m)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| °", "worst", "position mm", "worst")
@@ -89,6 +86,7 @@ def _page(
     job = SweepJob(plan, Round.first_of(plan))
     card = card_of(job, landmarks)
     axes = condition_axes([cell.condition for cell in cells])
+    most_rows = 80
     return page_template("phasemark.matcher.sweep", "page.html.j2").render(
         plan=plan,
         answer=answer(landmarks),
@@ -104,7 +102,7 @@ def _page(
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
             "share of classes right", "NEES per parameter", "coverage of the 95 % ellipsoid",
         ),
-        rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:_MOST_ROWS]],
+        rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:most_rows]],
         n_cells=len(landmarks),
         facts=_facts(plan, trials),
         commands=_commands(plan, folder),
@@ -118,7 +116,8 @@ def _written(shown: SweepFigure, folder: Path) -> dict[str, Any]:
         shown.figure.savefig(svg, format="svg", metadata={"Date": None})
     for kind, content in (("png", png), ("svg", svg.getvalue())):
         write_atomically(folder / f"{shown.name}.{kind}", content, force=True)
-    wide = shown.figure.get_figwidth() > _READABLE_IN
+    readable_in = 6.5  # wider figures keep their size on a phone, to be moved about
+    wide = shown.figure.get_figwidth() > readable_in
     return {"title": shown.title, "text": shown.text, "image": embedded_png(png, shown.title), "wide": wide}
 
 

@@ -28,9 +28,6 @@ from phasemark.render.view import delta_period_rad
 
 LEVELS = (0.5, 0.9, 0.95, 0.99)
 """Probabilities of the ellipsoids whose coverage is counted."""
-_ROWS_AT_ONCE = 5000
-_HONEST_SIGMA = 5.0
-"""An error within this many standard deviations of the bound is no outlier, however large it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -210,7 +207,9 @@ class SweepTrials:
         limit = np.array([self.outlier[0] if name.endswith("_m") else math.radians(self.outlier[1]) for name in VIEW])
         std = np.sqrt(np.einsum("npp->np", bound))
         with np.errstate(invalid="ignore"):
-            gross = answered & (np.abs(error) > np.fmax(limit[at], _HONEST_SIGMA * std)).any(axis=1)
+            # an error within this many standard deviations of the bound is no outlier, however large it is
+            honest_sigma = 5.0
+            gross = answered & (np.abs(error) > np.fmax(limit[at], honest_sigma * std)).any(axis=1)
         inner = answered & ~gross
         bounded = np.isfinite(std).all(axis=1)
         kept = error_statistics(
@@ -375,8 +374,9 @@ def csv_bytes(table: Mapping[str, Sequence[Any]], *, header: bool = True) -> byt
 
 def trials_csv(trials: SweepTrials) -> Iterator[bytes]:
     """Yield trials.csv piece by piece."""
-    for start in range(0, len(trials), _ROWS_AT_ONCE):
-        yield csv_bytes(trials.trial_table(slice(start, start + _ROWS_AT_ONCE)), header=start == 0)
+    rows_at_once = 5000
+    for start in range(0, len(trials), rows_at_once):
+        yield csv_bytes(trials.trial_table(slice(start, start + rows_at_once)), header=start == 0)
 
 
 def condition_axes(conditions: Sequence[Condition]) -> tuple[str, ...]:

@@ -43,7 +43,6 @@ _TITLES = {
     "merging": "Where two targets merge",
     "ambient": "Range against ambient light",
 }
-_LEAST_REACH = 1e-6  # of an axis: nothing below is anything but rounding
 _LOGARITHMIC = ("photon_transfer", "range_noise")
 _MAPS = {
     "range_offset_m": ("range offset", "mm", 1e3),
@@ -98,7 +97,8 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
         if name == "ambient":
             axes.set_xscale("log")
         low, high = axes.get_ylim()
-        axes.set_ylim(0.0 if name in _LOGARITHMIC else min(low, -_LEAST_REACH), max(high, _LEAST_REACH))
+        least_reach = 1e-6  # of an axis: nothing below is anything but rounding
+        axes.set_ylim(0.0 if name in _LOGARITHMIC else min(low, -least_reach), max(high, least_reach))
     _mark_limits(axes, name, found)
     axes.set(title=_TITLES[name], ylabel=_LABELS[series[0].y_name])
     axes.grid(alpha=0.3, which="both" if logarithmic else "major")

@@ -26,7 +26,6 @@ from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
 _CLEAR_SIGMAS = 6.0  # a tap this far from its limits reaches them in one of 1e9 readings
-_LEAST_NOISE_CODES = 0.5  # below, a converter's steps show and q²/12 is not their variance (PHYSICS section 4)
 _LOOK_UP_ABOVE, _LOOK_UP_NODES = 4096, 2401  # taps
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(64)
 
@@ -141,7 +140,9 @@ class ExpectedFlatField:
         if sensor.adc_bits is not None:
             clear &= (mean * sensor.gain + sensor.black_level > _CLEAR_SIGMAS * std * sensor.gain).all()
             before = np.sqrt(self.tap_variance_e2[..., alive] - sensor.code_e**2 / 12)
-            clear &= (before >= _LEAST_NOISE_CODES * sensor.code_e).all()
+            # below, a converter's steps show and q²/12 is not their variance (PHYSICS section 4)
+            least_noise_codes = 0.5
+            clear &= (before >= least_noise_codes * sensor.code_e).all()
         return bool(clear)
 
     @property

@@ -15,7 +15,6 @@ from scipy import special, stats
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.sensor.sensor import Sensor
 
-_MIDPOINTS = 160  # along the width and the height of a zone
 _CELLS_PER_BIN = 256
 _BORDERS = 2.5  # 1/e widths that a soft border is followed outwards
 _FINER = 16  # nodes of the cumulative response for each sample
@@ -164,10 +163,11 @@ def _plane_light(sensor: Sensor, distance_m: float, zone: int) -> Floats:
     ]
     blur = histogram.zone_blur
     profiles, tangents = [], []
+    midpoints = 160  # along the width and the height of a zone
     for middle, extent in zip(centre, half, strict=True):
         reach = extent + _BORDERS * blur
-        offset = reach * ((np.arange(_MIDPOINTS) + 0.5) / _MIDPOINTS * 2 - 1)
-        profile = np.ones(_MIDPOINTS)
+        offset = reach * ((np.arange(midpoints) + 0.5) / midpoints * 2 - 1)
+        profile = np.ones(midpoints)
         if blur > 0:
             profile = 0.5 * (special.erf((offset + extent) / blur) - special.erf((offset - extent) / blur))
         profiles.append(profile)

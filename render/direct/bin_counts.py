@@ -15,9 +15,6 @@ from phasemark.render.kernel import kernel
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
-_LEAST_SHARE = 1e-15
-"""Of the light from one range: a bin that gets less is not reached by it."""
-
 
 def response_share(delay_m: ArrayLike, histogram: Histogram, zone: int = 0) -> NDArray[np.float64]:
     """Return the share of the instrument response that arrives up to a delay: its cumulative distribution.
@@ -120,7 +117,8 @@ def counts_of_light(light: NDArray[np.float64], sensor: Sensor, axis: RangeAxis)
 @lru_cache(maxsize=16)
 def _reached_bins(sensor: Sensor, axis: RangeAxis) -> NDArray[np.int64]:
     """Return the first bin that light from each node reaches, and the one behind the last: (zones or 1, nodes, 2)."""
-    reached = bin_response(sensor, axis) > _LEAST_SHARE
+    least_share = 1e-15  # of the light from one range: a bin that gets less is not reached by it
+    reached = bin_response(sensor, axis) > least_share
     first, last = reached.argmax(axis=2), reached.shape[2] - reached[..., ::-1].argmax(axis=2)
     return np.stack([first, np.where(reached.any(axis=2), last, first)], axis=-1)
 

@@ -22,12 +22,6 @@ from phasemark.render.sensor.sensor import Sensor
 
 MARGIN = 2.0
 """Factor to which brightness is known."""
-_MORE_PEAKS = 2
-"""Peaks that may be reported, beside those that a chip reports at the same time."""
-_UNLIKELY = 4.0
-"""A bin lower than the highest by more standard deviations than this is not taken for the highest."""
-_DOUBTFUL_BINS = 1.5
-"""Peaks that are as far apart as the chip resolves, to within this, may be reported both."""
 
 
 class ExpectedTargets(NamedTuple):
@@ -50,7 +44,8 @@ class ExpectedTargets(NamedTuple):
 
 def most_peaks(sensor: Sensor) -> int:
     """Return how many targets of a zone are kept."""
-    return histogram_of(sensor).max_targets + _MORE_PEAKS
+    more_peaks = 2  # peaks that may be reported, beside those that a chip reports at the same time
+    return histogram_of(sensor).max_targets + more_peaks
 
 
 def expected_targets(counts: NDArray[np.float64], sensor: Sensor) -> ExpectedTargets:
@@ -98,6 +93,8 @@ def _expect(counts, centroid, reach, threshold, separation, reported, place, spr
     """Fill the targets of each histogram, the highest first."""
     n_bins, most = counts.shape[1], place.shape[1]
     tops, chance = scratch[1], scratch[2]
+    unlikely = 4.0  # A bin lower than the highest by more standard deviations than this is not taken for the highest.
+    doubtful_bins = 1.5  # peaks that are as far apart as the chip resolves, to within this, may be reported both
     for i in range(counts.shape[0]):
         row = counts[i]
         level = _median(row, scratch[0])
@@ -113,12 +110,12 @@ def _expect(counts, centroid, reach, threshold, separation, reported, place, spr
             above = height
             beaten = False
             for k in range(found):
-                near = abs(tops[k] - best) < separation - _DOUBTFUL_BINS
+                near = abs(tops[k] - best) < separation - doubtful_bins
                 beaten = beaten or (near and row[int(tops[k])] - level > MARGIN * (height - level))
             if beaten:
                 continue
             # bins about the peak, as far as they may be the highest
-            low, high, least = best, best, height - _UNLIKELY * math.sqrt(2 * height)
+            low, high, least = best, best, height - unlikely * math.sqrt(2 * height)
             while low > 1 and least < row[low - 1] <= height and best - low < separation:
                 low -= 1
             while high < n_bins - 2 and least < row[high + 1] <= height and high - best < separation:
@@ -143,6 +140,6 @@ def _expect(counts, centroid, reach, threshold, separation, reported, place, spr
             for m in range(found):
                 gap = abs(tops[k] - tops[m])
                 rival = MARGIN * (row[int(tops[m])] - level) > height
-                if m != k and rival and gap < separation + _DOUBTFUL_BINS:
+                if m != k and rival and gap < separation + doubtful_bins:
                     must = False
             sure[i, k] = must

@@ -20,11 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _COUNTS_COLOUR, _TARGET_COLOUR = "#2f6fe4", "#D55E00"
-_MARGIN = 0.06  # of a zone, on each side of its histogram
-_MARK_AT = 0.08  # of a zone from its top; counts end below
 _HEIGHT = 0.78
-_BEYOND_TARGETS = 1.3
-"""Histograms are drawn up to this multiple of the farthest target's place."""
 
 
 def histogram_figure(frames: HistogramFrames, index: int = 0, frame: int = 0) -> Figure:
@@ -83,18 +79,21 @@ def _draw_histograms(axes: Axes, counts: NDArray[np.float64], one: HistogramFram
     rows, cols = counts.shape[:2]
     places = _places(one)
     seen = np.concatenate([places[row, col] for row in range(rows) for col in range(cols)])
-    bins = min(counts.shape[2], int(_BEYOND_TARGETS * seen.max()) + 1) if len(seen) else counts.shape[2]
+    beyond_targets = 1.3  # histograms are drawn up to this multiple of the farthest target's place
+    bins = min(counts.shape[2], int(beyond_targets * seen.max()) + 1) if len(seen) else counts.shape[2]
     counts = counts[..., :bins]
     most = max(float(counts.max()), 1.0)
-    steps = np.repeat(_MARGIN + (1 - 2 * _MARGIN) * np.arange(bins + 1) / bins, 2)
+    margin = 0.06  # of a zone, on each side of its histogram
+    steps = np.repeat(margin + (1 - 2 * margin) * np.arange(bins + 1) / bins, 2)
     areas, marks = [], []
+    mark_at = 0.08  # of a zone from its top; counts end below
     for row in range(rows):
         for col in range(cols):
-            floor = row + 1 - _MARGIN
+            floor = row + 1 - margin
             height = floor - _HEIGHT * np.sqrt(counts[row, col] / most)
             outline = np.concatenate([[floor], np.repeat(height, 2), [floor]])
             areas.append(np.column_stack([col + steps, outline]))
-            marks += [(col + _MARGIN + (1 - 2 * _MARGIN) * place / bins, row + _MARK_AT) for place in places[row, col]]
+            marks += [(col + margin + (1 - 2 * margin) * place / bins, row + mark_at) for place in places[row, col]]
     axes.add_collection(PolyCollection(areas, facecolor=_COUNTS_COLOUR, edgecolor="none"))
     axes.vlines(range(cols + 1), 0, rows, color="0.8", linewidth=0.6)
     axes.hlines(range(rows + 1), 0, cols, color="0.8", linewidth=0.6)

@@ -9,14 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-_CLEAR_BINS = 10  # between the last bin that is taken and the highest one: the foot of the response is left out
-_LEAST_BINS = 6
-_LEAST_FRAMES = 4
-_GRID_BINS = 0.25
-_ASIDE_BINS = 0.05  # for the curvature of χ²
-_SURE = 25.0
-"""By how much χ² must fall for a crosstalk to be told: five standard deviations."""
-
 
 class Crosstalk(NamedTuple):
     """Light that comes back from the sensor's own window.
@@ -75,7 +67,8 @@ def fit_crosstalk(
     Crosstalk
     """
     early = _before_the_plane(counts)
-    known = (early.weight > 0).sum(axis=1) >= _LEAST_BINS
+    least_bins = 6
+    known = (early.weight > 0).sum(axis=1) >= least_bins
     if not known.any():
         return NO_CROSSTALK
     early = _Early(early.counts[known], early.weight[known])
@@ -87,22 +80,25 @@ def fit_crosstalk(
     delay = float(np.mean([first + step * np.searchsorted(row, 0.5) for row in cumulative]))
     last = int(np.flatnonzero(early.weight.any(axis=0)).max())
     width = float(widths.mean())
-    ranges = np.arange(-delay + 1, last - delay - 1, _GRID_BINS) * width
+    grid_bins = 0.25
+    ranges = np.arange(-delay + 1, last - delay - 1, grid_bins) * width
     if not len(ranges):
         return NO_CROSSTALK
     gains = [peak_at(float(r)).gain for r in ranges]
     best = float(ranges[int(np.argmax(gains))])
     found = minimize_scalar(
         lambda r: -peak_at(r).gain,
-        bounds=(best - _GRID_BINS * width, best + _GRID_BINS * width),
+        bounds=(best - grid_bins * width, best + grid_bins * width),
         method="bounded",
     )
     peak = peak_at(float(found.x))
     scale = max(peak.reduced_chi2, 1.0)
     std = math.sqrt(scale / peak.information) if peak.information > 0 else math.inf
-    if not (peak.height > 0 and peak.gain > _SURE * scale):
+    sure = 25.0  # by how much χ² must fall for a crosstalk to be told: five standard deviations
+    if not (peak.height > 0 and peak.gain > sure * scale):
         return Crosstalk(0.0, 0.0, std, math.inf)
-    aside = _ASIDE_BINS * width
+    aside_bins = 0.05  # for the curvature of χ²
+    aside = aside_bins * width
     curvature = (2 * peak.gain - peak_at(found.x - aside).gain - peak_at(found.x + aside).gain) / aside**2
     range_std = math.sqrt(2 * scale / curvature) if curvature > 0 else math.inf
     return Crosstalk(peak.height, float(found.x), std, range_std)
@@ -157,11 +153,13 @@ def _peak(early: _Early, shapes: NDArray[np.float64]) -> _Peak:
 def _before_the_plane(counts: NDArray[np.float64]) -> _Early:
     """Gather the bins before the plane's light over the frames in which they are."""
     n_bins = counts.shape[2]
-    clear = np.arange(n_bins) < counts.argmax(axis=2)[..., None] - _CLEAR_BINS
+    clear_bins = 10  # between the last bin that is taken and the highest one: the foot of the response is left out
+    clear = np.arange(n_bins) < counts.argmax(axis=2)[..., None] - clear_bins
     n = clear.sum(axis=0)
     total = np.where(clear, counts, 0.0).sum(axis=0)
     mean = total / np.maximum(n, 1)
     # a mean of n Poisson counts has the variance mean / n; an empty bin still says something
     frames = np.maximum(n, 1)
-    weight: NDArray[np.float64] = np.where(n >= _LEAST_FRAMES, frames / np.maximum(mean, 1.0 / frames), 0.0)
+    least_frames = 4
+    weight: NDArray[np.float64] = np.where(n >= least_frames, frames / np.maximum(mean, 1.0 / frames), 0.0)
     return _Early(mean, weight)

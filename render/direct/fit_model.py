@@ -30,7 +30,6 @@ _GEOMETRY = (
     "light_up",
 )  # fmt: skip
 _LEAST_LEFT = 0.05  # of the first photons, when pile-up is undone
-_AXIS_M = 0.9
 
 
 Parameters = dict[str, float]
@@ -142,7 +141,8 @@ class FitModel:
         self.histogram = histogram_of(sensor)
         self.grid = footprint_grid(sensor.with_(roll_deg=0.0), _MARGIN_CELLS, _CELLS)
         self.gain = np.ones(sensor.rows * sensor.cols) if gain is None else gain / gain.mean()
-        self.axis = RangeAxis(-0.002, 0.001, int(min(_AXIS_M, self.histogram.length_m) * 1000))
+        axis_m = 0.9
+        self.axis = RangeAxis(-0.002, 0.001, int(min(axis_m, self.histogram.length_m) * 1000))
         self._kept_light, self._kept_samples = lru_cache(4)(self._light), lru_cache(12)(self._samples)
 
     def bin_scales(self, p: Parameters) -> NDArray[np.float64]:

@@ -24,7 +24,6 @@ _STEP = 1 / 32
 _WINDOW = (8, 32)  # bins before and behind the highest that are fitted
 _ROUNDS = 4
 _RIDGE = 1e-6
-_GROUPS = 24  # pieces that the ranges of a zone are gathered in
 
 
 @lru_cache(maxsize=1)
@@ -114,7 +113,8 @@ def _gathered(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return a zone's ranges gathered in a few pieces, and the share of light of each."""
     lit = np.flatnonzero(light > 1e-6 * light.max())
-    group = np.arange(len(lit)) * min(_GROUPS, len(lit)) // len(lit)
+    groups = 24  # pieces that the ranges of a zone are gathered in
+    group = np.arange(len(lit)) * min(groups, len(lit)) // len(lit)
     total = np.bincount(group, light[lit])
     return np.bincount(group, light[lit] * nodes[lit]) / total, total / total.sum()
 

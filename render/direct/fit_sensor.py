@@ -41,11 +41,8 @@ from phasemark.render.sensor.sensor import Sensor
 _STEP = 0.05
 """Step of differences, in scales of the parameters."""
 _ROUNDS = 3
-_EVALUATIONS = 6
-_MOST_PLANES = 40
 _IRF_STEP_BINS = 1 / 6
 _RANGE_WINDOW = (5, 12)
-_PLANE_ALBEDO = 0.8
 
 
 @dataclass(frozen=True)
@@ -149,7 +146,8 @@ def fit_direct_sensor(
     shifts = [one.frames.reference_shift_bins for one in objects] + [plane.frames.reference_shift_bins]
     if not any(shift.any() for shift in shifts):
         free.remove("reference_gain")
-    some = plane[np.arange(0, len(plane.frames), max(1, len(plane.frames) // _MOST_PLANES))]
+    most_planes = 40
+    some = plane[np.arange(0, len(plane.frames), max(1, len(plane.frames) // most_planes))]
     recordings: list[PlaneRecording | ObjectRecording] = [some, *objects]
     jacobian = np.zeros((0, 0))
     cost = 1.0
@@ -259,7 +257,8 @@ def _fit_parameters(
         return np.stack(columns, axis=1)
 
     start = np.array([p[name] for name in scales]) / scale
-    found = least_squares(at, start, jac=slope, loss="soft_l1", max_nfev=_EVALUATIONS)
+    evaluations = 6
+    found = least_squares(at, start, jac=slope, loss="soft_l1", max_nfev=evaluations)
     return moved(found.x), np.asarray(found.jac), float(2 * found.cost / max(len(found.fun) - len(scale), 1))
 
 
@@ -346,7 +345,8 @@ def _as_sensor(
     ambient = measured[..., AMBIENT_BINS].mean(axis=-1)
     signal = (measured - ambient[..., None]).sum(axis=-1)
     intensity = model.transients(p, plane).sum(axis=(1, 3)) / model.gain
-    per_light = np.median(signal / (intensity * _PLANE_ALBEDO), axis=0)
+    plane_albedo = 0.8
+    per_light = np.median(signal / (intensity * plane_albedo), axis=0)
     tan_h, tan_v = p["pitch_h"] * cols / 2, p["pitch_v"] * rows / 2
     offsets = (delays * scales - start_bins) * width_m
     return base.with_(

@@ -23,17 +23,11 @@ _REACH = 2.5
 
 _CELLS = {1: 16, 2: 12, 3: 8, 4: 6, 8: 4}
 """Cells of the grid per zone pitch, by the number of zones along a side; more zones than stated get fewer cells."""
-_FEWEST_CELLS = 3
-_MOST_REFINED = 5
-"""A sharp border that lies on no cell border gets up to this many times as many cells, until it does."""
 _REFINED = 4
 """Where no number of cells puts a sharp border onto a cell border, there are this many times as many."""
 
-_LEAST_BLUR = 0.35
-"""Borders that do not lie on cell borders are softened by this share of a cell."""
 
 _ALIGNED = 1e-9
-_AREA_POINTS = 96
 
 
 class Footprints(NamedTuple):
@@ -88,8 +82,9 @@ def footprints_of(sensor: Sensor) -> Footprints:
     scale = np.array(histogram.zone_scale) * np.array(sensor.fill_factor)
     half = np.broadcast_to(0.5 * pitch * scale, centre.shape).copy()
     soft = histogram.zone_blur > 0
+    least_blur = 0.35  # borders that do not lie on cell borders are softened by this share of a cell
     least = [
-        0.0 if soft or _aligned(n, s) else _LEAST_BLUR * p / n
+        0.0 if soft or _aligned(n, s) else least_blur * p / n
         for n, s, p in zip(cells_per_zone(sensor), scale, pitch, strict=True)
     ]
     light = 0.0 if histogram.light_width is None else 1 / histogram.light_width**2
@@ -100,11 +95,15 @@ def cells_per_zone(sensor: Sensor) -> tuple[int, int]:
     """Return how many grid cells lie along the width and the height of a zone's share."""
     histogram = histogram_of(sensor)
 
+    fewest_cells = 3
+    # A sharp border that lies on no cell border gets up to this many times as many cells, until it does.
+    most_refined = 5
+
     def cells(zones: int, scale: float) -> int:
-        least = next((n for most, n in _CELLS.items() if zones <= most), _FEWEST_CELLS)
+        least = next((n for most, n in _CELLS.items() if zones <= most), fewest_cells)
         if histogram.zone_blur > 0:
             return least
-        return next((n for n in range(least, _MOST_REFINED * least + 1) if _aligned(n, scale)), _REFINED * least)
+        return next((n for n in range(least, most_refined * least + 1) if _aligned(n, scale)), _REFINED * least)
 
     scale = [s * f for s, f in zip(histogram.zone_scale, sensor.fill_factor, strict=True)]
     return cells(sensor.cols, scale[0]), cells(sensor.rows, scale[1])
@@ -186,13 +185,14 @@ def footprint_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
 @kernel
 def _fill_areas(zones, areas):  # type: ignore[no-untyped-def]
     """Fill the areas of all footprints: the profiles along y and z are independent, and so is the light."""
+    area_points = 96
     for k in range(len(areas)):
         areas[k] = 1.0
         for axis in range(2):
             half, blur, centre = zones.half[k, axis], zones.blur[axis], zones.centre[k, axis] - zones.light[axis]
             reach = half + _REACH * blur
             total = 0.0
-            for j in range(_AREA_POINTS):
-                x = ((j + 0.5) / _AREA_POINTS * 2.0 - 1.0) * reach
+            for j in range(area_points):
+                x = ((j + 0.5) / area_points * 2.0 - 1.0) * reach
                 total += border_profile(x, half, blur) * math.exp(-0.5 * zones.light[2] * (x + centre) ** 2)
-            areas[k] *= total * 2.0 * reach / _AREA_POINTS
+            areas[k] *= total * 2.0 * reach / area_points

@@ -23,7 +23,6 @@ from phasemark.render.threads import mapped
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LEAST_CENTROID_COUNTS = 1.0
 _REFERENCE_WINDOW = (4, 8)
 """Bins before and after the highest bin that the centroid of the reference histogram takes in."""
 
@@ -174,8 +173,9 @@ def reference_centroid(reference: NDArray[np.float64]) -> NDArray[np.float64]:
     window = slice(max(top - _REFERENCE_WINDOW[0], 0), top + _REFERENCE_WINDOW[1])
     part = reference[:, window]
     total = part.sum(axis=1)
-    if (total < _LEAST_CENTROID_COUNTS).any():
-        raise UsageError(f"reference histogram {int((total < _LEAST_CENTROID_COUNTS).argmax())} is empty")
+    least_centroid_counts = 1.0
+    if (total < least_centroid_counts).any():
+        raise UsageError(f"reference histogram {int((total < least_centroid_counts).argmax())} is empty")
     bins = np.arange(reference.shape[1])[window]
     return np.asarray((part @ bins) / total)
 

@@ -12,8 +12,6 @@ from phasemark.render.exposure.random_streams import Term, fill_normal, fill_uni
 
 _SHOT = int(Term.SHOT)
 _INVERSION_BELOW = 10.0
-_MOST_INVERTED = 80
-"""Largest count drawn by inversion: a mean of 10 exceeds it once in 1e40."""
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -38,7 +36,8 @@ def draw_counts(means, start, stop, n_frames, first_view, first_frame, key, out)
     words, chosen = np.empty((4, half), np.uint64), np.empty(half, np.int32)
     uniform, normal = np.empty((2, half)), np.empty(half)
     bright = np.empty(2, np.bool_)
-    reciprocal = 1.0 / np.arange(1.0, _MOST_INVERTED + 2)
+    most_inverted = 80  # largest count drawn by inversion: a mean of 10 exceeds it once in 1e40
+    reciprocal = 1.0 / np.arange(1.0, most_inverted + 2)
     none, last_view = np.empty(n), -1  # the probability of no count
     for i in range(start, stop):
         view = i // n_frames
@@ -56,7 +55,7 @@ def draw_counts(means, start, stop, n_frames, first_view, first_frame, key, out)
                 if m < _INVERSION_BELOW:
                     u, term, count = uniform[side, k - first], none[k], 0
                     total = term
-                    while u > total and count < _MOST_INVERTED:  # add up probabilities from zero
+                    while u > total and count < most_inverted:  # add up probabilities from zero
                         term *= m * reciprocal[count]
                         count += 1
                         total += term

@@ -14,7 +14,6 @@ from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.rigid import rigid_transforms
 
 _LEVEL = 0.999  # least upward part of the normal of a level face
-_SAME_HEIGHT_M = 1e-3
 
 OPTICAL2CAM = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From the optical frame (x right, y down, z forward) to the camera frame (x forward, y left, z up)."""
@@ -159,6 +158,7 @@ def support_height(mesh: trimesh.Trimesh) -> float:
     if not level.any():
         raise UsageError("the mesh has no level face: an object's mesh must hold the table that it stands on")
     height = np.asarray(mesh.triangles_center)[level, 2]
-    steps, group = np.unique(np.round(height / _SAME_HEIGHT_M), return_inverse=True)
+    same_height_m = 1e-3
+    steps, group = np.unique(np.round(height / same_height_m), return_inverse=True)
     area = np.bincount(group, np.asarray(mesh.area_faces)[level], minlength=len(steps))
     return float(np.median(height[group == area.argmax()]))

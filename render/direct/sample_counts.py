@@ -28,8 +28,6 @@ from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 
 _ALL_PARTS = FLOOR + 1
-_STEPS_PER_STD = 64
-_STEPS_PER_SAMPLE = 32
 
 
 class _Response(NamedTuple):
@@ -124,9 +122,11 @@ def _optics_of(sensor: Sensor) -> _Optics:
     n_zones = sensor.rows * sensor.cols
     low, high = histogram.irf_reach_m
     if histogram.irf_std_m is not None:
-        step = histogram.irf_std_m / _STEPS_PER_STD
+        steps_per_std = 64
+        step = histogram.irf_std_m / steps_per_std
     else:
-        step = (high - low) / ((len(histogram.irf[0]) - 1) * _STEPS_PER_SAMPLE)
+        steps_per_sample = 32
+        step = (high - low) / ((len(histogram.irf[0]) - 1) * steps_per_sample)
     delay = low + step * np.arange(int(np.ceil((high - low) / step)) + 1)
     alike = len(histogram.irf) <= 1
     share = np.stack([response_share(delay, histogram, zone) for zone in range(1 if alike else n_zones)])

@@ -35,9 +35,6 @@ LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
 _BEFORE_WALL = WALL - 1  # planes are numbered from 1
 _SAMPLES = 1 << 15
 _MOST_BOXES = 32
-_RADIANS_PER_SCALE = 1.5
-"""What the rule for split cells takes as the turn of a phase, for each `finest_m` of range."""
-_PLANE_POINTS = 2  # Gauss points a side of a cell: the integrand of a plane is smooth
 
 
 class SceneSamples(NamedTuple):
@@ -170,7 +167,9 @@ class SceneMesh:
             n_edges = len(mesh.creases) + len(mesh.folds)
             buffers = _Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
         behind = bool(background[:2].any())
-        fastest = _RADIANS_PER_SCALE / scale[0] if behind else 0.0
+        # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
+        radians_per_scale = 1.5
+        fastest = radians_per_scale / scale[0] if behind else 0.0
         while True:
             reached, n = plan_rays(
                 0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
@@ -215,7 +214,8 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
         All of part 0.
     """
     distances = np.atleast_1d(np.asarray(distance_m, dtype=np.float64))
-    nodes, weights = gauss_legendre(_PLANE_POINTS)
+    plane_points = 2  # gauss points a side of a cell: the integrand of a plane is smooth
+    nodes, weights = gauss_legendre(plane_points)
     u = (np.arange(grid.cols)[:, None] + nodes).ravel()
     v = (np.arange(grid.rows)[:, None] + nodes).ravel()
     y, z = np.meshgrid((grid.centre_u - u) / grid.scale_u, (grid.centre_v - v) / grid.scale_v)

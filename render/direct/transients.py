@@ -25,9 +25,6 @@ from phasemark.render.sensor.sensor import Sensor
 PARTS = 2
 """Parts of a scene that may differ in albedo."""
 
-_NODES_PER_BIN = 16
-_BORDER = 2  # nodes beyond either end, for the outermost Lagrange weights
-
 
 class RangeAxis(NamedTuple):
     """Evenly spaced ranges: n nodes from `first_m`, `step_m` apart."""
@@ -53,11 +50,13 @@ def range_axis(sensor: Sensor, *, longest_m: float | None = None) -> RangeAxis:
         Where the axis may end before the histogram does, for scenes that do.
     """
     histogram = histogram_of(sensor)
-    step = histogram.bin_width_m / _NODES_PER_BIN
+    nodes_per_bin = 16
+    step = histogram.bin_width_m / nodes_per_bin
     last = histogram.start_m + 1.1 * histogram.length_m - min(histogram.irf_reach_m[0], 0.0)
     if longest_m is not None:
         last = min(last, longest_m)
-    return RangeAxis(-_BORDER * step, step, int(np.ceil(max(last, step) / step)) + 2 * _BORDER)
+    border = 2  # nodes beyond either end, for the outermost Lagrange weights
+    return RangeAxis(-border * step, step, int(np.ceil(max(last, step) / step)) + 2 * border)
 
 
 def zone_transients(

@@ -14,8 +14,6 @@ from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import Views
 
-_SAME_LINE_RAD = 1e-9  # rounding of an angle, or of metres
-
 
 @dataclass(frozen=True)
 class Motion:
@@ -135,7 +133,8 @@ def _after_motion(background: Background, views: Views, moved: Views, motion: Mo
         return background
     swing = moved.bearing_rad + motion.yaw_rate_rad_s * time_s - views.bearing_rad
     nearer = views.distance_m - moved.distance_m
-    if np.abs(np.sin(swing)).max() > _SAME_LINE_RAD or np.ptp(nearer) > _SAME_LINE_RAD:
+    same_line_rad = 1e-9  # rounding of an angle, or of metres
+    if np.abs(np.sin(swing)).max() > same_line_rad or np.ptp(nearer) > same_line_rad:
         raise UsageError(
             "'wall_m' cannot be rendered for this motion: a wall stands square to the line of sight, which must not "
             "swing; add the wall to the mesh instead"

@@ -19,9 +19,6 @@ FULL = -1
 """Number of segments that says that there is no room for more."""
 _FLAT_PX = 1.5e-5
 """Largest distance of a curve from its chord at which the chord alone is taken: its area is not corrected."""
-_SAGITTA_PX = 1.5e-4
-"""Largest distance of a curve from the chord of one link."""
-_MOST_LINKS = 4096
 _SHORT = math.sqrt(0.5)
 """First and last link of a chain, in lengths of the others."""
 
@@ -153,5 +150,7 @@ def _count_links(ya, za, dy, dz, ua, va, ub, vb, camera):  # type: ignore[no-unt
     # the second difference over a quarter is eight times a quarter's sagitta; sagittas go with the square of lengths
     if 2.0 * widest <= _FLAT_PX:
         return 1
-    links = math.ceil(4.0 * math.sqrt(widest / (8.0 * _SAGITTA_PX)) + 2.0 * (1.0 - _SHORT))
-    return min(max(links, 2), _MOST_LINKS)
+    sagitta_px = 1.5e-4  # largest distance of a curve from the chord of one link
+    links = math.ceil(4.0 * math.sqrt(widest / (8.0 * sagitta_px)) + 2.0 * (1.0 - _SHORT))
+    most_links = 4096
+    return min(max(links, 2), most_links)

@@ -19,8 +19,6 @@ from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, 
 from phasemark.render.integral.mesh_topology import CLUSTER
 from phasemark.render.kernel import kernel
 
-_NEAR_M = 1e-6
-
 
 @kernel
 def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-def]
@@ -119,18 +117,19 @@ def project(vertices, a, b, matrix, offset, camera, segment):  # type: ignore[no
     """
     ax = matrix[0, 0] * vertices[a, 0] + matrix[0, 1] * vertices[a, 1] + matrix[0, 2] * vertices[a, 2] + offset[0]
     bx = matrix[0, 0] * vertices[b, 0] + matrix[0, 1] * vertices[b, 1] + matrix[0, 2] * vertices[b, 2] + offset[0]
-    if ax < _NEAR_M and bx < _NEAR_M:
+    near_m = 1e-6
+    if ax < near_m and bx < near_m:
         return 0
     ay = matrix[1, 0] * vertices[a, 0] + matrix[1, 1] * vertices[a, 1] + matrix[1, 2] * vertices[a, 2] + offset[1]
     by = matrix[1, 0] * vertices[b, 0] + matrix[1, 1] * vertices[b, 1] + matrix[1, 2] * vertices[b, 2] + offset[1]
     az = matrix[2, 0] * vertices[a, 0] + matrix[2, 1] * vertices[a, 1] + matrix[2, 2] * vertices[a, 2] + offset[2]
     bz = matrix[2, 0] * vertices[b, 0] + matrix[2, 1] * vertices[b, 1] + matrix[2, 2] * vertices[b, 2] + offset[2]
-    if ax < _NEAR_M:
-        w = (_NEAR_M - ax) / (bx - ax)
-        ax, ay, az = _NEAR_M, ay + w * (by - ay), az + w * (bz - az)
-    elif bx < _NEAR_M:
-        w = (_NEAR_M - bx) / (ax - bx)
-        bx, by, bz = _NEAR_M, by + w * (ay - by), bz + w * (az - bz)
+    if ax < near_m:
+        w = (near_m - ax) / (bx - ax)
+        ax, ay, az = near_m, ay + w * (by - ay), az + w * (bz - az)
+    elif bx < near_m:
+        w = (near_m - bx) / (ax - bx)
+        bx, by, bz = near_m, by + w * (ay - by), bz + w * (az - bz)
     segment[0] = camera.centre_u - camera.scale_u * ay / ax
     segment[1] = camera.centre_v - camera.scale_v * az / ax
     segment[2] = camera.centre_u - camera.scale_u * by / bx

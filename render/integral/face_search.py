@@ -24,16 +24,8 @@ _MOST_CELLS = 1 << 18
 _FINER = 1.5
 """Cells of the grid per face that is crossed."""
 _MOST_STEPS = 16
-_MOST_LOOKS = 6
-"""Into the grid, for one ray."""
-_FAR = 1.5
-"""Barycentric coordinate below minus this: the face is far from the hit, and the grid is asked."""
 _GRAZING = 1e-3
 """Cosine between ray and normal below which the plane of a face says little of where the surface is met."""
-_EDGE = 1e-3
-"""Barycentric coordinate below minus this: the ray does not meet the edge between two faces."""
-_SMOOTH = 0.1
-"""Sine by which a chord between two hits may lean on the mean of their normals; on an arc it does not at all."""
 
 
 class FaceGrid(NamedTuple):
@@ -183,6 +175,9 @@ def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-u
     f, before, looks = start, -1, 0
     patch = search[start, 15]
     grazing = _GRAZING * _GRAZING * (dx * dx + dy * dy + dz * dz)
+    most_looks = 6  # into the grid, for one ray
+    far = 1.5  # barycentric coordinate below minus this: the face is far from the hit, and the grid is asked
+    edge = 1e-3  # barycentric coordinate below minus this: the ray does not meet the edge between two faces
     for _ in range(_MOST_STEPS):
         face = search[f]
         # all that follows is multiplied by `facing`, so that no step waits for a division
@@ -198,7 +193,7 @@ def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-u
         least = min(u, v, w)
         if least >= 0.0:
             return f, height / facing
-        if least < -_FAR * facing and looks < _MOST_LOOKS:
+        if least < -far * facing and looks < most_looks:
             looks += 1
             t = height / facing
             g = _face_about(grid, ox + t * dx, oy + t * dy, oz + t * dz)
@@ -210,7 +205,7 @@ def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-u
         if g < 0:
             return -1, 0.0
         if g == before:  # on the edge between the two
-            return (f, height / facing) if least > -_EDGE * facing else (-1, 0.0)
+            return (f, height / facing) if least > -edge * facing else (-1, 0.0)
         before, f = f, g
     return -1, 0.0
 
@@ -223,4 +218,6 @@ def turns_smoothly(search, f, g, x, y, z):  # type: ignore[no-untyped-def]
     one that is seen, it does not.
     """
     lean = (search[f, 0] + search[g, 0]) * x + (search[f, 1] + search[g, 1]) * y + (search[f, 2] + search[g, 2]) * z
-    return lean * lean <= _SMOOTH * _SMOOTH * (x * x + y * y + z * z)
+    # sine by which a chord between two hits may lean on the mean of their normals; on an arc it does not at all
+    smooth = 0.1
+    return lean * lean <= smooth * smooth * (x * x + y * y + z * z)

@@ -12,9 +12,6 @@ from phasemark.render.integral.arguments import towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.kernel import kernel
 
-_PER_PART_RAD = 1.0
-"""Turn of the phase that two Gauss points a side integrate."""
-_MOST_PARTS = 32.0
 _DARK = 2e-6
 """Amplitude, 1 being albedo 1 facing at 1 m, below which the phase of a pixel does not matter."""
 
@@ -74,4 +71,6 @@ def _recedes(one, other):  # type: ignore[no-untyped-def]
 @kernel
 def _parts(turn):  # type: ignore[no-untyped-def]
     """Return how many parts a turn of the phase takes."""
-    return int(max(math.ceil(min(turn / _PER_PART_RAD, _MOST_PARTS)), 1))
+    per_part_rad = 1.0  # turn of the phase that two Gauss points a side integrate
+    most_parts = 32.0
+    return int(max(math.ceil(min(turn / per_part_rad, most_parts)), 1))

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render.kernel import kernel
 
-_LEAF = 4
 _DEEPEST = 128  # nodes that wait to be looked at
 MOST_SCENES = 800
 """Embree ends the process when about a thousand scenes are open."""
@@ -160,6 +159,7 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
     stack = np.empty((_DEEPEST, 3), np.int64)
     stack[0] = (0, 0, n)
     used, depth = 1, 1
+    leaf = 4
     while depth > 0:
         depth -= 1
         node, start, stop = stack[depth]
@@ -173,7 +173,7 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
                 bounds[node, 3 + k] = max(bounds[node, 3 + k], high[f, k])
                 centre_low[k] = min(centre_low[k], centre[f, k])
                 centre_high[k] = max(centre_high[k], centre[f, k])
-        if stop - start <= _LEAF:
+        if stop - start <= leaf:
             children[node] = (-1 - start, stop - start)
             continue
         axis = np.argmax(centre_high - centre_low)

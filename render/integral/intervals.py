@@ -19,14 +19,10 @@ from phasemark.render.kernel import kernel
 
 EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
-_NARROW = 0.04
-"""Strips narrower than this share of their box get one line."""
 _TRIFLE = 4e-5
 """Area times squared extent, in those of the box, under which a piece gets one line."""
 _STRIP, _LIMB_STRIP = 0.6, 0.25
 """Largest extent, in sides of the box, of a piece with one Gauss rule: in general, and where a limb runs across it."""
-_PARALLEL = 0.1
-"""A limb runs along an interval if it keeps its distance from both ends as well as this, in lengths of the box."""
 _SHRINKS = 0.3
 """An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
 
@@ -75,6 +71,8 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
     points, weights, regions = samples.points, samples.weights, samples.regions
     start, stop = scratch.slabs[0, 0], scratch.slabs[strip.n_slabs - 1, 1]
     size = max(box.s1 - box.s0, box.x1 - box.x0)
+    # A limb runs along an interval if it keeps its distance from both ends as well as this, in lengths of the box.
+    parallel = 0.1
     for i in range(strip.k + 1):
         a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
         near_left, near_right = a - left < FELT, right - b < FELT
@@ -88,7 +86,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
             _, _, left_high, right_high = _interval(stop, i, strip, box, scratch, near_left, near_right)
             for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
                 moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
-                steep = steep or (near and not moved < _PARALLEL * (box.s1 - box.s0))
+                steep = steep or (near and not moved < parallel * (box.s1 - box.s0))
         pieces = math.ceil(extent / (size * (_LIMB_STRIP if steep else _STRIP)) - 1e-9)
         low, high = (max(b_low - a_low, 0.0), max(b_high - a_high, 0.0)) if limb else (1.0, 1.0)
         pieces += min(low, high) < _SHRINKS * width
@@ -176,7 +174,8 @@ def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     extent = max(hi - lo, abs(last_a - first_a), abs(last_b - first_b))
     length, side = box.s1 - box.s0, box.x1 - box.x0
     trifle = _TRIFLE * length * length * side * side
-    if extent < _NARROW * length or m0 * extent * extent < trifle or variance < 1e-12:
+    narrow = 0.04  # strips narrower than this share of their box get one line
+    if extent < narrow * length or m0 * extent * extent < trifle or variance < 1e-12:
         return 1, m0, origin + mean, 0.0, 1.0
     skew = (m3 / m0 - mean * (3.0 * m2 / m0 - 2.0 * mean * mean)) / variance
     root = math.sqrt(skew * skew + 4.0 * variance)

@@ -13,8 +13,6 @@ from phasemark.render.sensor.lens_fields import Lens
 from phasemark.render.sensor.lens_map import distort
 from phasemark.render.sensor.sensor import Sensor
 
-_MARGIN_PX = 4.0
-"""How far beyond the image edges are followed; limbs are felt up to a pixel and a half beyond it."""
 _SLACK = 0.05
 """Share of a pixel's rays by which its corners, edge middles and centre may miss the rays between them."""
 _STEP = 1e-4
@@ -43,7 +41,8 @@ def _tables(lens: Lens, rows: int, cols: int, fill_factor: tuple[float, float], 
     border = np.concatenate([nodes[0], nodes[-1], nodes[:, 0], nodes[:, -1]])
     low, high = border.min(axis=0), border.max(axis=0)
     pixel = np.abs(np.concatenate([np.diff(nodes, axis=0).reshape(-1, 2), np.diff(nodes, axis=1).reshape(-1, 2)]))
-    margin = 2 * _MARGIN_PX * pixel.max(axis=0)
+    margin_px = 4.0  # how far beyond the image edges are followed; limbs are felt up to a pixel and a half beyond it
+    margin = 2 * margin_px * pixel.max(axis=0)
     low, high = low - margin, high + margin
     radius = max(mapped.largest_tangent, float(np.hypot(*border.T).max()))
     inside = np.empty((0, 2))

@@ -16,8 +16,6 @@ from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
 from phasemark.render.kernel import inlined, kernel
 
-_RADIANS_PER_BOX = 2.0
-"""How far the fastest phase turns along a box of 4 × 4 Gauss points: the error is some 1e-6 of its light."""
 _MOST_BOXES = 64
 
 
@@ -190,7 +188,9 @@ def _boxes(c, r, width, height, background, cos_b, sin_b, level, camera, fastest
         return 1
     if near == 0.0 or far == 0.0:
         return _MOST_BOXES
-    return int(min(max(math.ceil(abs(far - near) * fastest / _RADIANS_PER_BOX), 1.0), _MOST_BOXES))
+    # how far the fastest phase turns along a box of 4 × 4 Gauss points: the error is some 1e-6 of its light
+    radians_per_box = 2.0
+    return int(min(max(math.ceil(abs(far - near) * fastest / radians_per_box), 1.0), _MOST_BOXES))
 
 
 @kernel

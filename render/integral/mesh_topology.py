@@ -21,7 +21,6 @@ from phasemark.render.integral.surface_mesh import SurfaceMesh
 CREASE_RAD = math.radians(30.0)
 CLUSTER = 32
 """Faces that are looked at together for silhouettes."""
-_COPLANAR_RAD = 1e-7
 _HOLLOW = 1e-9
 """Share of the mesh's extent by which a face rises before its neighbour's plane in a hollow; rounding is less."""
 
@@ -133,7 +132,8 @@ class MeshTopology(NamedTuple):
         first, other = edges[:, 2], edges[:, 3]
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
         crease = ~regular | (turn > CREASE_RAD + 1e-9)
-        fold = ~crease & (turn > _COPLANAR_RAD)
+        coplanar_rad = 1e-7
+        fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
         corners = _corner_normals(vertices, faces, normals, patch)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)

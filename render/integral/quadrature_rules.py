@@ -16,8 +16,6 @@ from phasemark.render.kernel import kernel
 
 _THIN = 0.15
 """Intervals narrower than this share of their box get one Gauss point."""
-_WIDE = 0.3
-"""Intervals wider than this share of their box get three Gauss points on a curved surface, the others two."""
 _BESIDE_LIMB = (0.1, 0.6)
 """Intervals beside a limb get two Gauss points, or three, or four where they are wider than this (pixels)."""
 FELT = 1.5
@@ -46,6 +44,8 @@ def place_points(a, b, left, right, side, bent, points, weights):  # type: ignor
     near_left, near_right = a - left < FELT, right - b < FELT
     middle, half = 0.0, 0.0
     count = 2 + (b - a > _BESIDE_LIMB[0]) + (b - a > _BESIDE_LIMB[1])
+    # intervals wider than this share of their box get three Gauss points on a curved surface, the others two
+    wide = 0.3
     if near_left and near_right:
         middle, half = 0.5 * (left + right), 0.5 * (right - left)
         t0 = math.asin(min(max((a - middle) / half, -1.0), 1.0))
@@ -56,7 +56,7 @@ def place_points(a, b, left, right, side, bent, points, weights):  # type: ignor
     elif near_right:
         t0, t1 = math.sqrt(max(right - a, 0.0)), math.sqrt(max(right - b, 0.0))
     else:
-        count = 1 if b - a < _THIN * side else (3 if bent and b - a > _WIDE * side else 2)
+        count = 1 if b - a < _THIN * side else (3 if bent and b - a > wide * side else 2)
         t0, t1 = a, b
     total = 0.0
     for g in range(count):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-_ERROR_DIGITS = 2
 _EXACT = 1e-12  # an error below this share of the value is the computer's, not the measurement's
 _PLAIN = ".6g"  # of a value without an error
 
@@ -92,8 +91,9 @@ def with_interval(value: float, low: float, high: float) -> str:
 
 def _decimal_places(error: float) -> int:
     """Return the decimal place of an error's last significant digit, negative before the point."""
-    exponent = int(f"{error:.{_ERROR_DIGITS - 1}e}".split("e")[1])  # of the rounded error: 0.0996 is 0.10
-    return _ERROR_DIGITS - 1 - exponent
+    error_digits = 2
+    exponent = int(f"{error:.{error_digits - 1}e}".split("e")[1])  # of the rounded error: 0.0996 is 0.10
+    return error_digits - 1 - exponent
 
 
 def _fixed(value: float, places: int) -> str:

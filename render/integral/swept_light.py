@@ -11,9 +11,6 @@ from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.light import landmark_hit, phasor_of
 from phasemark.render.kernel import kernel
 
-_SAME_DEPTH = 1e-4
-"""Relative difference of two depths up to which they are one."""
-
 
 @kernel
 def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope):  # type: ignore[no-untyped-def]
@@ -42,13 +39,14 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             count = region + 1
     first_of[count] = n
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
+    same_depth = 1e-4  # relative difference of two depths up to which they are one
     for b in range(borders.placed[0]):
         index = borders.pixel[b]
         view = index // pixels_per_view
         y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
         depth_left, left = _light_beside(b, 0, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
         depth_right, right = _light_beside(b, 1, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
-        limit, side = borders.depth[b] * (1.0 - _SAME_DEPTH), borders.side[b]
+        limit, side = borders.depth[b] * (1.0 - same_depth), borders.side[b]
         if side > 0.0:  # at a limb cos θ of its own surface is 0, and so is its light; hidden, it changes nothing
             jump = left if depth_left > limit else 0j
         elif side < 0.0:

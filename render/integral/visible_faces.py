@@ -14,9 +14,6 @@ from phasemark.render.integral.face_search import find_face, look_about, plane_h
 from phasemark.render.integral.ray_plan import SPLIT
 from phasemark.render.kernel import inlined, kernel
 
-_LOOKS = 2
-"""Into the grid, for each sample, before its face is searched for step by step."""
-
 
 @kernel
 def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
@@ -92,7 +89,8 @@ def _search(start, stop, scout, count, mesh, samples, poses, camera):  # type: i
     view = samples.pixel[scout] // ((camera.stop_row - camera.first_row) * camera.cols)
     ox, oy, oz = poses.lens[view, 0], poses.lens[view, 1], poses.lens[view, 2]
     matrix, found = poses.matrix[view], face[scout]
-    for look in range(_LOOKS):
+    looks = 2  # into the grid, for each sample, before its face is searched for step by step
+    for look in range(looks):
         for i in range(start, stop):
             y, z = rays[i, 0], rays[i, 1]
             dx, dy, dz = towards_landmark(matrix, y, z)

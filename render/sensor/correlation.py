@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 SQUARE_PEAK = math.pi**2 / 8
 """Largest value of Σ cos(kx)/k² over odd k: the triangle that correlates a square wave with a square wave."""
 
-_NEGLIGIBLE = 1e-12  # of the fundamental: what rounding leaves of an order that is not there
-
 
 class Harmonic(NamedTuple):
     """One order k > 1 of the correlation, relative to the first.
@@ -74,12 +72,13 @@ def pulse_harmonics(emitted: ArrayLike, reference: ArrayLike, max_order: int) ->
     """
     light, gate = np.asarray(emitted, dtype=float), np.asarray(reference, dtype=float)
     spectrum = np.conj(np.fft.rfft(light)) * np.fft.rfft(gate)
-    if not abs(spectrum[1]) > _NEGLIGIBLE * np.linalg.norm(light) * np.linalg.norm(gate) * len(light):
+    negligible = 1e-12  # of the fundamental: what rounding leaves of an order that is not there
+    if not abs(spectrum[1]) > negligible * np.linalg.norm(light) * np.linalg.norm(gate) * len(light):
         raise ValueError("must have a first harmonic in both pulses: their correlation shows no range")
     found = []
     for k in range(2, min(max_order, (len(light) - 1) // 2) + 1):
         amplitude = abs(spectrum[k] / spectrum[1])
-        if amplitude > _NEGLIGIBLE:
+        if amplitude > negligible:
             phase = math.remainder(float(np.angle(spectrum[k]) - k * np.angle(spectrum[1])), 2 * math.pi)
             found.append(Harmonic(k, float(amplitude), phase))
     return tuple(found)

@@ -19,8 +19,6 @@ _Row = tuple[_Number, ...]
 
 MOST_TARGETS = 4
 
-_LEAST_IRF_SAMPLES = 3
-
 
 class Histogram(FieldTable):
     """Histograms of a direct sensor's zones, and the estimator of its chip (PHYSICS section 11).
@@ -163,9 +161,10 @@ class Histogram(FieldTable):
         if self.irf_step_m is None:
             raise ValueError("'irf_step_m' must be given with 'irf': the distance of its samples, metres")
         lengths = {len(row) for row in self.irf}
-        if len(lengths) > 1 or min(lengths) < _LEAST_IRF_SAMPLES:
+        least_irf_samples = 3
+        if len(lengths) > 1 or min(lengths) < least_irf_samples:
             raise ValueError(
-                f"'irf' must have rows of one length, at least {_LEAST_IRF_SAMPLES} samples, got rows of"
+                f"'irf' must have rows of one length, at least {least_irf_samples} samples, got rows of"
                 f" {' and '.join(map(str, sorted(lengths)))}"
             )
         for k, row in enumerate(self.irf):

@@ -35,8 +35,6 @@ LENS_FIELD = "lens."
 _MOST_PIXELS = 4096  # along a side of an image
 _OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
 _FARTHEST = 1.0  # the same of a camera that may read a part of an image
-_FARTHEST_OF_PART = 1.5  # of the whole image's size, from the centre of a part of it
-_SOLVED = 1e-13  # relative difference of tangents up to which focal lengths are solved for
 _MOST_STEPS = 30
 _SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
 
@@ -191,7 +189,8 @@ def farthest_principal_point(
     whole_image_px : (width, height) or None
         The image that this one is a part of.
     """
-    size, share = (image_px, _FARTHEST) if whole_image_px is None else (whole_image_px, _FARTHEST_OF_PART)
+    farthest_of_part = 1.5  # of the whole image's size, from the centre of a part of it
+    size, share = (image_px, _FARTHEST) if whole_image_px is None else (whole_image_px, farthest_of_part)
     return share * size[0], share * size[1]
 
 
@@ -246,13 +245,14 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
     point = changes.get("principal_point_px")
     if point is not None:
         lens = lens.with_terms(cx=point[0] - 0.5, cy=point[1] - 0.5)
+    solved = 1e-13  # relative difference of tangents up to which focal lengths are solved for
     for name, focal, axis in (("half_angle_h_deg", "fx", 0), ("half_angle_v_deg", "fy", 1)):
         if name not in changes:
             continue
         wanted = math.tan(math.radians(changes[name]))
         for _ in range(_MOST_STEPS):  # the tangents go nearly with the reciprocal of the focal length
             ratio = lens.before(rows, cols).tan_half_angles[axis] / wanted
-            if abs(ratio - 1) < _SOLVED:
+            if abs(ratio - 1) < solved:
                 break
             lens = lens.with_terms(**{focal: getattr(lens, focal) * ratio})
     return lens

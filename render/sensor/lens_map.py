@@ -24,7 +24,6 @@ _RADII = 4096  # of the table that Newton's method starts from
 _STEPS = 40  # of Newton's method at most
 _ROUNDING = 1e-14  # last step of Newton's method
 _CHECKED = 64  # points along each side of an image at which its lens is checked
-_DIRECTIONS = 64  # in which a fold is looked for
 
 
 def distort(model: int, k: Any, x: Any, y: Any) -> tuple[Any, Any, Any, Any, Any]:
@@ -200,18 +199,19 @@ class LensMap:
 
     def _fold(self) -> tuple[float, float] | None:
         """Return where the lens folds nearest to the principal point: pixels from there, and the tangent."""
-        direction = np.linspace(0.0, 2 * math.pi, _DIRECTIONS, endpoint=False)[:, None]
+        directions = 64  # in which a fold is looked for
+        direction = np.linspace(0.0, 2 * math.pi, directions, endpoint=False)[:, None]
         radius = np.tan(np.linspace(0.0, math.radians(MOST_DEG), _RADII))
         x, y = radius * np.cos(direction), radius * np.sin(direction)
         with np.errstate(all="ignore"):
             a, b, xx, xy, yy = distort(self.model, self.k, x, y)
             folded = ~((xx * yy - xy * xy > 0) & (xx + yy > 0))
         first = np.argmax(folded, axis=1)
-        has = folded[np.arange(_DIRECTIONS), first]
+        has = folded[np.arange(directions), first]
         if not has.any():
             return None
         at = np.maximum(first - 1, 0)
-        line = np.arange(_DIRECTIONS)
+        line = np.arange(directions)
         away = np.hypot(self.focal_px[0] * a[line, at], self.focal_px[1] * b[line, at])
         nearest = int(np.argmin(np.where(has, away, np.inf)))
         return float(away[nearest]), float(radius[at[nearest]])

@@ -16,13 +16,10 @@ from phasemark.render.sensor.sensor_quantities import SensorQuantities
 PATTERN_BOUND = 3.0
 """Fixed patterns are normal and end at this many standard deviations: no pixel of a camera that works lies beyond."""
 
-_LEAST_PULSE_SAMPLES = 8
 
 DIRECT_MODULATION_HZ = 1e4
 """Highest `modulation_hz` of a direct sensor: at 10 m a phase of 4e-3 rad, whose mixing moves a mean range by 1e-6."""
 
-_SEMIDEFINITE = 1e-5
-"""Negative eigenvalue of a correlation matrix that rounding to the digits of a file may cause."""
 
 _ROUNDING = 1e-9  # of a limit that files state in decimals
 
@@ -85,10 +82,11 @@ def check_correlation(sensor: SensorQuantities) -> None:
         raise ValueError(f"'harmonics' must name each order once, got the orders {orders}")
     if sensor.modulation == "pulse":
         n, m = len(sensor.emitted_pulse), len(sensor.reference_pulse)
-        if n != m or n < _LEAST_PULSE_SAMPLES:
+        least_pulse_samples = 8
+        if n != m or n < least_pulse_samples:
             raise ValueError(
                 f"'emitted_pulse' and 'reference_pulse' must have the same number of samples, at least "
-                f"{_LEAST_PULSE_SAMPLES}, got {n} and {m}"
+                f"{least_pulse_samples}, got {n} and {m}"
             )
         try:
             pulse_harmonics(sensor.emitted_pulse, sensor.reference_pulse, sensor.max_harmonic)
@@ -199,10 +197,11 @@ def check_tables(sensor: SensorQuantities) -> None:
         raise ValueError(f"'calibration_covariance' must have no negative variance, got {variance[k]:g}")
     root = np.sqrt(np.where(variance > 0, variance, 1.0))
     correlation = matrix / np.outer(root, root)
-    if not np.allclose(correlation, correlation.T, rtol=0, atol=_SEMIDEFINITE):
+    semidefinite = 1e-5  # negative eigenvalue of a correlation matrix that rounding to the digits of a file may cause
+    if not np.allclose(correlation, correlation.T, rtol=0, atol=semidefinite):
         raise ValueError("'calibration_covariance' must be symmetric")
     lowest = float(np.linalg.eigvalsh(correlation).min()) if names else 0.0
-    if lowest < -_SEMIDEFINITE:
+    if lowest < -semidefinite:
         raise ValueError(
             f"'calibration_covariance' must be positive semidefinite, but its correlation matrix has the eigenvalue"
             f" {lowest:.3g}"

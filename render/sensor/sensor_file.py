@@ -17,8 +17,6 @@ from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_fields import TABLES
 from phasemark.render.sensor.sources import SOURCE_TABLE, kind_of_source, without_sources
 
-_DIGITS = 7  # of a number in a sensor file
-
 
 def sensor_toml(sensor: Sensor, comments: Mapping[str, str], *, header: Sequence[str], otherwise: str) -> str:
     """Return a sensor as the text of a file that :meth:`Sensor.from_toml` reads, with its table ``[source]``.
@@ -104,7 +102,8 @@ def rounded(value: Any) -> Any:
     """Round the floats of a field to the digits of a sensor file."""
     if isinstance(value, tuple):
         return tuple(rounded(one) for one in value)
-    return float(f"{value:.{_DIGITS}g}") if isinstance(value, float) else value
+    digits = 7  # of a number in a sensor file
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
 def _default_of(model: type[BaseModel], name: str) -> object:

@@ -23,7 +23,6 @@ AXIS_LABEL = {
 LOGARITHMIC = ("distance_m", "noise_factor", "n_frames", "albedo")
 NOMINAL = ("unit", "wall_m")
 """Axes whose values lie beside one another without anything between them; 0 stands for none."""
-_MOST_TICKS = 9
 
 
 def methods_of(cells: Sequence[Cell]) -> list[str]:
@@ -33,9 +32,10 @@ def methods_of(cells: Sequence[Cell]) -> list[str]:
 
 def value_ticks(axis: Axis, name: str, values: Sequence[float]) -> None:
     """Put a design's values on an axis: each of them, if they are few."""
+    most_ticks = 9
     if name in NOMINAL:
         axis.set_ticks(range(len(values)), ["none" if value == 0 else f"{value:g}" for value in values])
     elif name in LOGARITHMIC:
         logarithmic(axis, values)
-    elif len(values) <= _MOST_TICKS:
+    elif len(values) <= most_ticks:
         axis.set_ticks(list(values), [f"{value:g}" for value in values])

@@ -25,11 +25,8 @@ from phasemark.render.charts import (
 )
 
 _MOST_POINTS = 2000
-_LEAST_BOUND = 1e-7
 _ASIDE = 1.25
 """By which factor the marks of one method are moved from those of the next."""
-_CLEAR_BARS = 60
-"""Bars side by side that do not hide the marks; more are drawn the fainter."""
 
 
 def nees_quantiles(trials: SweepTrials) -> Figure:
@@ -59,6 +56,7 @@ def nees_quantiles(trials: SweepTrials) -> Figure:
 def coverage(cells: Sequence[Cell]) -> Figure:
     """Draw the share of errors within the ellipsoid of each probability, cell by cell."""
     figure, (row,) = panels(len(LEVELS), width=2.7)
+    clear_bars = 60  # bars side by side that do not hide the marks; more are drawn the fainter
     for panel, level in zip(row, LEVELS, strict=True):
         for k, method in enumerate(methods_of(cells)):
             colour, mark, _ = style(k)
@@ -67,7 +65,7 @@ def coverage(cells: Sequence[Cell]) -> Figure:
             low, shares, high = (
                 [100 * getattr(cell.coverage[level], end) for cell in mine] for end in ("low", "value", "high")
             )
-            panel.vlines(x, low, high, color=colour, linewidth=0.5, alpha=min(1.0, _CLEAR_BARS / max(1, len(mine))))
+            panel.vlines(x, low, high, color=colour, linewidth=0.5, alpha=min(1.0, clear_bars / max(1, len(mine))))
             if mine:
                 panel.plot(x, shares, mark, color=colour, markersize=2, label=as_written(method))
         panel.axhline(100 * level, color="black", linewidth=0.8)
@@ -100,11 +98,12 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
     figure, ((panel,),) = panels(1, width=7.4)
     least = 1.0
     methods = methods_of(cells)
+    least_bound = 1e-7
     for k, method in enumerate(methods):
         colour, mark, _ = style(k)
         mine = [cell for cell in cells if cell.method == method and math.isfinite(cell.confusion_bound)]
         aside = _ASIDE ** (k - (len(methods) - 1) / 2)  # or methods that are right alike hide one another
-        x = aside * np.array([max(cell.confusion_bound, _LEAST_BOUND) for cell in mine])
+        x = aside * np.array([max(cell.confusion_bound, least_bound) for cell in mine])
         n_wrong = [cell.n - round(cell.class_right.value * cell.n) for cell in mine]
         wrong = [binomial_interval(k, cell.n, law="student") for k, cell in zip(n_wrong, mine, strict=True)]
         high = np.array([one.high for one in wrong])
@@ -117,10 +116,10 @@ def confusion_bound(cells: Sequence[Cell]) -> Figure:
         )
         panel.plot(x[never], high[never], marker=7, color=colour, markersize=4, linestyle="none", alpha=0.6)
         least = min(least, *high, *share[~never])
-    ends = np.array([_LEAST_BOUND, 1.0])
+    ends = np.array([least_bound, 1.0])
     panel.plot(ends, ends, color="black", linewidth=0.8, label="bound")
     panel.set(xscale="log", yscale="log", ylim=(0.3 * least, 1.5))
-    x_label = f"bound on the probability of a wrong class (–), {_LEAST_BOUND:g} where it is less"
+    x_label = f"bound on the probability of a wrong class (–), {least_bound:g} where it is less"
     explain(panel, x_label, "share of wrong classes (–)")
     legend_above(figure, panel)
     return figure

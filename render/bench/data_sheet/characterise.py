@@ -18,9 +18,6 @@ from phasemark.render.bench.data_sheet.phase import phase_rows
 from phasemark.render.bench.data_sheet.results import Characterisation, Comparison, SheetQuantity
 from phasemark.render.sensor.sensor import Sensor
 
-_SAMPLES_PER_POINT = 51_200  # σ is known to 0.3 %
-_FEWEST_FRAMES = 8
-
 
 def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | None = None) -> Characterisation:
     """Run a sensor before flat fields and compare what it reports with closed forms.
@@ -50,7 +47,9 @@ def characterise(sensor: Sensor, *, rng: np.random.Generator, n_frames: int | No
     """
     sensor.refuse_several_frequencies("a data sheet")
     if n_frames is None:
-        n_frames = max(_FEWEST_FRAMES, math.ceil(_SAMPLES_PER_POINT / (sensor.rows * sensor.cols)))
+        samples_per_point = 51_200  # σ is known to 0.3 %
+        fewest_frames = 8
+        n_frames = max(fewest_frames, math.ceil(samples_per_point / (sensor.rows * sensor.cols)))
     if n_frames < 2:
         raise UsageError(f"'n_frames' must be at least 2, for one frame has no noise, got {n_frames}")
     bench = Bench(sensor, rng, n_frames)

@@ -27,17 +27,10 @@ from phasemark.render.sensor.range_noise import direct_range_std
 from phasemark.render.sensor.sensor import Sensor
 
 _FRAMES_AT_ONCE = 64
-_LEAST_COUNTS = 25.0  # all frames together, for the mean of a bin to be near to normal
-_INTEGRAL = 3e-4
-"""Error of the simulation's integral over soft zones, of the highest bin; 1e-3 is the bar."""
 _SHOWN = 2.0
 """Bins up to this multiple of the plane's distance are shown."""
-_PHASES = 4  # places within a bin
 _READINGS = 2000  # of a point of the curves of shares
 _AMBIENT_FACTORS = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0)
-_LEAST_AMBIENT = 1e-7
-_MOST_AMBIENT = 0.15
-"""Share of the cycles that ambient light may fire; with more, pile-up tilts the level that the chip takes for even."""
 _AROUND = np.linspace(0.8, 1.2, 9)
 """Distances about the predicted one at which detection is measured."""
 
@@ -134,17 +127,19 @@ def _counts(bench: Bench) -> Iterator[Row]:
     for start in range(0, n, _FRAMES_AT_ONCE):
         total += bench.histograms(expected, min(_FRAMES_AT_ONCE, n - start)).zone_counts[0]
     predicted = plane_counts(sensor, distance_m, ALBEDOS[-1])
-    error = np.hypot(np.sqrt(predicted / n), _INTEGRAL * predicted.max(axis=1, keepdims=True))
+    integral = 3e-4  # error of the simulation's integral over soft zones, of the highest bin; 1e-3 is the bar
+    error = np.hypot(np.sqrt(predicted / n), integral * predicted.max(axis=1, keepdims=True))
     histogram = histogram_of(sensor)
     edges = np.asarray(histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1), np.float64)
     shown = min(int(np.searchsorted(edges, _SHOWN * distance_m)), histogram.bins)
     alive = np.flatnonzero(bench.alive.ravel())
     middle = (sensor.rows // 2) * sensor.cols + sensor.cols // 2
+    least_counts = 25.0  # all frames together, for the mean of a bin to be near to normal
     for zone in dict.fromkeys((int(alive[np.abs(alive - middle).argmin()]), int(alive[0]))):
         law, found = predicted[zone, :shown], total[zone, :shown] / n
         yield bench.series(
             "histogram", f"zone {divmod(zone, sensor.cols)}", ("range_m", "counts"),
-            (0.5 * (edges[1:] + edges[:-1])[:shown], law, found, error[zone, :shown], law * n > _LEAST_COUNTS),
+            (0.5 * (edges[1:] + edges[:-1])[:shown], law, found, error[zone, :shown], law * n > least_counts),
             (np.repeat(edges[: shown + 1], 2)[1:-1], np.repeat(law, 2)), samples=n,
         )  # fmt: skip
 
@@ -195,8 +190,9 @@ def _merging(bench: Bench) -> Iterator[Row]:
         return
     limit_m = merging_distance_m(sensor)
     centre_m = max(_reference_m(sensor), 0.9 * limit_m)
-    centres_m = centre_m + histogram.bin_width_m * np.arange(_PHASES) / _PHASES
-    n = max(1, math.ceil(_READINGS / (_PHASES * sensor.rows * sensor.cols)))
+    phases = 4  # places within a bin
+    centres_m = centre_m + histogram.bin_width_m * np.arange(phases) / phases
+    n = max(1, math.ceil(_READINGS / (phases * sensor.rows * sensor.cols)))
 
     def two_share(separation: float) -> float:
         ranges_m = centres_m[:, None] + separation * np.array([-0.5, 0.5])
@@ -205,7 +201,7 @@ def _merging(bench: Bench) -> Iterator[Row]:
 
     points = _step(
         bench, ("merging", "two equal targets", ("separation_m", "two_targets_share")),
-        limit_m * np.linspace(0.4, 1.6, 29), limit_m, two_share, n * _PHASES * int(bench.alive.sum()),
+        limit_m * np.linspace(0.4, 1.6, 29), limit_m, two_share, n * phases * int(bench.alive.sum()),
     )  # fmt: skip
     yield points
     title = "separation from which two equal targets are two (m)"
@@ -217,12 +213,15 @@ def _ambient(bench: Bench, albedo: float) -> Iterator[Row]:
     """Measure the distance at which half of the frames find a surface, against ambient light."""
     sensor = bench.sensor
     histogram = histogram_of(sensor)
-    own = max(histogram.ambient, _LEAST_AMBIENT)
+    least_ambient = 1e-7
+    own = max(histogram.ambient, least_ambient)
     n = max(1, math.ceil(_READINGS / (sensor.rows * sensor.cols)))
     samples = n * int(bench.alive.sum())
     rows: list[tuple[float, float, float, float, bool]] = []
+    # share of the cycles that ambient light may fire; with more, pile-up tilts the level that the chip takes for even
+    most_ambient = 0.15
     for ambient in (own * factor for factor in _AMBIENT_FACTORS):
-        if ambient * histogram.bins > _MOST_AMBIENT:
+        if ambient * histogram.bins > most_ambient:
             break
         lit = sensor.with_(histogram={**histogram.model_dump(), "ambient": ambient})
         half_m = _half_found_m(lit, albedo)

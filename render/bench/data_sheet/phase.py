@@ -24,13 +24,6 @@ from phasemark.render.frames import Flag, Frames
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.sensor.range_noise import exact_phase_moments, predicted_range_std
 
-_EMVA_LINEAR_SHARE = 0.7  # of saturation: EMVA 1288's range for the photon-transfer fit
-_LARGEST_PHASE_STD_RAD = 0.15  # beyond, counts of electrons are so few that no Gaussian density is exact
-_LINEARITY_SPAN = 1.5  # unambiguous ranges
-_LINEARITY_POINTS = 53  # prime: every period of an error is met at other phases
-_FLAGS_BEGIN = 0.01  # share of the frames
-_FEWEST_FLAGGED = 10  # frames on either side of a share: more are near enough to normal for χ²
-
 
 def phase_rows(bench: Bench) -> Iterator[Row]:
     """Measure everything that the data sheet of a camera with taps has."""
@@ -70,7 +63,8 @@ def _photon_transfer(bench: Bench) -> Iterator[Row]:
         (line, shot * line + floor * per_e**2), samples=8 * bench.samples,
     )  # fmt: skip
     yield points
-    linear = points.compared & (points.x <= _EMVA_LINEAR_SHARE * full * per_e)
+    emva_linear_share = 0.7  # of saturation: EMVA 1288's range for the photon-transfer fit
+    linear = points.compared & (points.x <= emva_linear_share * full * per_e)
     if linear.sum() < 3:
         yield "Without noise that a converter can see there is no photon transfer to fit."
         return
@@ -95,7 +89,8 @@ def _range_noise(bench: Bench, albedo: float) -> Iterator[Row]:
     law = predicted_range_std(albedo / line**2, albedo / line**2, sensor)
     expected = [expected_flat_field(sensor, d, albedo / d**2) for d in line]
     curve = [math.sqrt(bench.mean(one.range_variance_m2)) for one in expected]
-    clear = (law <= _LARGEST_PHASE_STD_RAD * sensor.metres_per_radian) & [one.clear_of_limits for one in expected]
+    largest_phase_std_rad = 0.15  # beyond, counts of electrons are so few that no Gaussian density is exact
+    clear = (law <= largest_phase_std_rad * sensor.metres_per_radian) & [one.clear_of_limits for one in expected]
     if not clear.any():
         yield f"Range noise on albedo {albedo:g} has no distance where nothing clips and the law holds."
         return
@@ -120,7 +115,8 @@ def _range_noise(bench: Bench, albedo: float) -> Iterator[Row]:
 def _linearity(bench: Bench) -> Iterator[Row]:
     """Measure the error of the mean range along a delay line, light held constant, beyond the wrap as well."""
     sensor, amplitude = bench.open, bench.safe_amplitude
-    span = _LINEARITY_SPAN * sensor.unambiguous_range_m
+    linearity_span = 1.5  # unambiguous ranges
+    span = linearity_span * sensor.unambiguous_range_m
 
     def mean_error(range_m: float, expected: ExpectedFlatField) -> float:
         return bench.mean(wrap_difference_m(expected.range_m - range_m, sensor))
@@ -133,7 +129,8 @@ def _linearity(bench: Bench) -> Iterator[Row]:
         return range_m, mean, found, error, expected.clear_of_limits
 
     line = np.linspace(0.0, span, 361)
-    ranges = span * (np.arange(_LINEARITY_POINTS) + 0.5) / _LINEARITY_POINTS
+    linearity_points = 53  # prime: every period of an error is met at other phases
+    ranges = span * (np.arange(linearity_points) + 0.5) / linearity_points
     points = bench.series(
         "linearity", f"light of intensity {amplitude:.3g}", ("range_m", "mean_range_error_m"),
         zip(*map(point, ranges), strict=True),
@@ -228,7 +225,8 @@ def _saturation(bench: Bench) -> Iterator[Row]:
         (line, np.array([probability(signal_e).mean() for signal_e in line])),
     )  # fmt: skip
     yield points
-    for name, words, at in (("begin", "1 % of frames are", _FLAGS_BEGIN), ("half", "half of the frames are", 0.5)):
+    flags_begin = 0.01  # share of the frames
+    for name, words, at in (("begin", "1 % of frames are", flags_begin), ("half", "half of the frames are", 0.5)):
         title = f"signal at which {words} flagged as saturated (e-)"
         yield crossing_of(points, at, signal_of(at), f"saturation_flags_{name}_e", title)
 
@@ -270,11 +268,12 @@ def _flagged_share(
     curve: tuple[Floats, Floats] | None = None,
 ) -> Comparison:
     """Return the share of flagged frames beside its probability, compared if there is a curve of the prediction."""
+    fewest_flagged = 10  # frames on either side of a share: more are near enough to normal for χ²
 
     def point(at: float) -> tuple[float, ...]:
         expected = np.asarray(probability(at))
         share, spread = float(expected.mean()), float((expected * (1 - expected)).mean())
-        enough = curve is not None and min(share, 1 - share) * bench.samples >= _FEWEST_FLAGGED
+        enough = curve is not None and min(share, 1 - share) * bench.samples >= fewest_flagged
         return at, share, bench.flagged(take(at), flag), math.sqrt(max(spread, 0.0) / bench.samples), enough
 
     return bench.series(*head, zip(*map(point, x), strict=True), curve)

@@ -21,11 +21,8 @@ PIXEL_STD_ERROR = 0.25
 FEWEST_FRAMES = math.ceil(1 + 1 / (2 * PIXEL_STD_ERROR**2))
 """Frames at each distance that a fit needs: they tell the noise of one pixel to 25 %."""
 DEAD_SHARE = 0.5  # a pixel that is valid in fewer frames, at every distance, is called dead
-_USED_SHARE = 0.9  # a pixel that drops out more often is a selection of its own noise, and left out
-_BOARD_SHARE = 0.75  # a distance at which fewer of the living pixels can be used is left out
 DISTANCE_STD_M = 1e-3
 """Assumed standard deviation of a board's distance: that of a laser distance meter or a steel tape, read with care."""
-_MOST_DISTANCE_STD = 0.1  # of the distance: the propagation is linear
 
 
 class Moments(NamedTuple):
@@ -79,14 +76,16 @@ class BoardData:
         """
         images = [board_image(base, d, rho) for d, rho in zip(distance_m, albedo, strict=True)]
         share = np.array([one.valid[0].mean(axis=0) for one in frames])
-        usable = share >= _USED_SHARE
+        used_share = 0.9  # a pixel that drops out more often is a selection of its own noise, and left out
+        usable = share >= used_share
         alive = usable.any(axis=0)
         if not alive.any():
             raise UsageError(
-                f"no pixel is valid in {100 * _USED_SHARE:.0f} % of the frames at any distance: there is nothing to fit"
+                f"no pixel is valid in {100 * used_share:.0f} % of the frames at any distance: there is nothing to fit"
             )
         of_board = usable[:, alive].mean(axis=1)
-        kept = (of_board >= _BOARD_SHARE) | (np.arange(len(frames)) == of_board.argmax())
+        board_share = 0.75  # a distance at which fewer of the living pixels can be used is left out
+        kept = (of_board >= board_share) | (np.arange(len(frames)) == of_board.argmax())
         notes += [
             f"The frames at {distance:g} m were left out: {100 * answers:.0f} % of the pixels answer there."
             for distance, answers, used in zip(distance_m, of_board, kept, strict=True)
@@ -189,13 +188,14 @@ def known_distance_std(
 ) -> list[float]:
     """Return the standard deviation of each distance, and describe it in a note."""
     std = one_for_each(DISTANCE_STD_M if stated is None else stated, distance_m, "'distance_std_m'")
+    most_distance_std = 0.1  # of the distance: the propagation is linear
     if stated is None:  # of a board a few millimetres away it would be no small error
-        std = [min(one, _MOST_DISTANCE_STD * d) for one, d in zip(std, distance_m, strict=True)]
+        std = [min(one, most_distance_std * d) for one, d in zip(std, distance_m, strict=True)]
     for one, distance in zip(std, distance_m, strict=True):
-        if distance > 0 and not 0 <= one <= _MOST_DISTANCE_STD * distance:
+        if distance > 0 and not 0 <= one <= most_distance_std * distance:
             raise UsageError(
                 f"'distance_std_m' must be a number of metres from 0 to a tenth of the distance, "
-                f"{_MOST_DISTANCE_STD * distance:g} at {distance:g} m, got {one:g}"
+                f"{most_distance_std * distance:g} at {distance:g} m, got {one:g}"
             )
     if not any(std):
         notes.append("The distances were taken to be exact; standard errors hold only as far as they are.")

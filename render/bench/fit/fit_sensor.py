@@ -28,8 +28,6 @@ from phasemark.render.integral.rounding import with_error
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_file import rounded
 
-_CORRELATED_SIGMAS = 4.0
-
 
 def fit_sensor(
     frames: Sequence[Frames],
@@ -106,7 +104,8 @@ def fit_sensor(
     if not (data.used(data.variance_m2) > 0).any():
         raise UsageError("the frames have no noise: every range is the same in all of them; is one frame repeated?")
     correlation, correlation_error = data.frame_correlation()
-    if abs(correlation) > _CORRELATED_SIGMAS * correlation_error:
+    correlated_sigmas = 4.0
+    if abs(correlation) > correlated_sigmas * correlation_error:
         found.notes.append(
             "Frames are not independent: the noise of a pixel correlates by "
             f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "

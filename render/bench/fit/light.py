@@ -28,7 +28,6 @@ from phasemark.render.sensor.range_noise import exact_phase_moments
 NOISE_LEVELS_RATIO = 1.5  # largest light over smallest that tells two terms of the noise law apart
 _CLEAR_SIGMAS = 2.0  # a number within fewer standard errors of zero is not seen
 _ROUNDS = 4  # weights of the noise follow from its fit: weights from the data would favour what chance made small
-_SOURCE_STEP = 1e-3  # standard deviations, for derivatives
 
 
 class _Lines:
@@ -116,8 +115,9 @@ class _Lines:
     def derived(self, function: Callable[..., float], names: str) -> tuple[float, float]:
         """Return a function of the numbers and its standard error."""
         values = np.array([self.values[name] for name in names])
-        errors = _SOURCE_STEP * np.array([self.errors[name] for name in names])
-        parts = [(function(*(values + one)) - function(*(values - one))) / (2 * _SOURCE_STEP) for one in errors.T]
+        source_step = 1e-3  # standard deviations, for derivatives
+        errors = source_step * np.array([self.errors[name] for name in names])
+        parts = [(function(*(values + one)) - function(*(values - one))) / (2 * source_step) for one in errors.T]
         return float(function(*values)), float(np.linalg.norm(parts))
 
     def seen(self, name: str) -> bool:

@@ -18,12 +18,8 @@ from phasemark.render.sensor.correlation import Harmonic, correlation_curve
 from phasemark.render.sensor.sensor import Sensor
 
 _WIGGLING_ORDERS = ((3, 7), (3,))  # most first; each order is two numbers
-_WORST_CONDITION = 20.0  # of the wiggling's design: beyond, the distances cover too little of its period
-_SEEN_SIGMAS = 4.0  # below, an order of the correlation is not there
 _NOISY_FACTOR = 2.0  # σ of a pixel over that of its neighbours, beside the test of χ²
 _OUTLIER_SIGMAS = 6.0
-_PIXEL_FALSE_ALARM = 1e-3  # of all pixels together
-_DELAY_STEP_RAD = 1e-4
 _SINE: dict[str, Any] = {
     "modulation": "sine",
     "max_harmonic": 49,
@@ -77,17 +73,19 @@ def fit_offsets(data: BoardData, found: Findings) -> None:
             seen.append((one, math.sqrt(float(gradient @ covariance[own, own] @ gradient))))
         return float(solved.x[0]) * scale, math.sqrt(covariance[0, 0]) * scale, seen
 
+    worst_condition = 20.0  # of the wiggling's design: beyond, the distances cover too little of its period
+    seen_sigmas = 4.0  # below, an order of the correlation is not there
     for orders in _WIGGLING_ORDERS:
         parts = [part((k + 1) * phase).mean(axis=1) for k in orders for part in (np.cos, np.sin)]
         design = np.column_stack([np.ones(m), *parts])
         if base.kind == "direct" or m < 1 + design.shape[1]:
             continue
-        if np.linalg.cond(design / np.linalg.norm(design, axis=0)) > _WORST_CONDITION:
+        if np.linalg.cond(design / np.linalg.norm(design, axis=0)) > worst_condition:
             continue
         offset_m, error_m, seen = fitted(orders)
         described = ", ".join(f"a_{one.order} = {with_error(one.amplitude, error)}" for one, error in seen)
         found.fields |= _SINE
-        if any(one.amplitude >= _SEEN_SIGMAS * error for one, error in seen):
+        if any(one.amplitude >= seen_sigmas * error for one, error in seen):
             found.add("range_offset_m", offset_m, error_m, f"mean error at {m} distances, less wiggling")
             found.add(
                 "harmonics", seen[0][0].amplitude, seen[0][1],
@@ -125,8 +123,9 @@ def pixel_offsets(data: BoardData, found: Findings) -> tuple[Floats, Floats, Flo
         harmonics = tuple(Harmonic(*one) for one in found.fields["harmonics"])
     delay, truth = found.fields["range_offset_m"] / scale, data.used(data.truth_m)
     model = _range_error_m(truth / scale, delay, harmonics, sensor)
-    later = _range_error_m(truth / scale, delay + _DELAY_STEP_RAD, harmonics, sensor)
-    slope = wrap_difference_m(later - model, sensor) / (_DELAY_STEP_RAD * scale)
+    delay_step_rad = 1e-4
+    later = _range_error_m(truth / scale, delay + delay_step_rad, harmonics, sensor)
+    slope = wrap_difference_m(later - model, sensor) / (delay_step_rad * scale)
     residual = wrap_difference_m(data.used([one.mean for one in data.error_m]) - model, sensor)
     # without any noise every distance counts alike
     weight = 1 / np.maximum(data.used(data.variance_m2) / data.used(data.n), 1e-18)
@@ -152,7 +151,8 @@ def odd_pixels(data: BoardData, offset_m: Floats) -> NDArray[np.bool_]:
     scaled = np.where(good, data.variance_m2 * data.light, np.nan)  # shot noise: σ² follows 1 / light
     middle = np.nanmedian(scaled, axis=(1, 2), keepdims=True)
     stuck = good & (middle > 0).all() & (data.variance_m2 == 0).any(axis=0)
-    limit = special.chdtri(data.n - 1, _PIXEL_FALSE_ALARM / scaled.size) / np.maximum(data.n - 1, 1)
+    pixel_false_alarm = 1e-3  # of all pixels together
+    limit = special.chdtri(data.n - 1, pixel_false_alarm / scaled.size) / np.maximum(data.n - 1, 1)
     loud = np.nan_to_num(scaled) > np.maximum(limit, _NOISY_FACTOR**2) * middle
     centre = np.nanmedian(offset_m)
     spread = 1.4826 * np.nanmedian(np.abs(offset_m - centre))
