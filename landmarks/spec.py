@@ -4,32 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator
 
-from phasemark import UsageError
-from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.field_table import FieldTable
 
 _Length = Annotated[float, Field(gt=0, le=10, allow_inf_nan=False)]
 _Coordinate = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 
 
-class _Spec(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    def __init__(self, **data: Any) -> None:
-        refuse_truth_values(data, type(self).model_fields)
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            first = error.errors()[0]
-            raise UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"]) from None
-
-
-class Box(_Spec):
+class Box(FieldTable):
     """The lower part: x' along the length, y' along the width, its top in the plane z' = 0.
 
     Parameters
@@ -48,7 +35,7 @@ class Box(_Spec):
     height_m: _Length
 
 
-class Cylinder(_Spec):
+class Cylinder(FieldTable):
     """An upright circular cylinder.
 
     Parameters
@@ -68,7 +55,7 @@ class Cylinder(_Spec):
         return np.where((z_m >= 0) & (z_m <= self.height_m), self.radius_m, 0.0)
 
 
-class Cone(_Spec):
+class Cone(FieldTable):
     """An upright circular cone, its tip up.
 
     Parameters
@@ -90,7 +77,7 @@ class Cone(_Spec):
         return np.where(z_m >= 0, self.radius_m * np.maximum(1 - z_m / self.height_m, 0.0), 0.0)
 
 
-class Sphere(_Spec):
+class Sphere(FieldTable):
     """A sphere that touches the box's top in one point.
 
     Parameters
@@ -109,7 +96,7 @@ class Sphere(_Spec):
         return np.sqrt(np.maximum(self.radius_m**2 - (z_m - self.radius_m) ** 2, 0.0))
 
 
-class Revolution(_Spec):
+class Revolution(FieldTable):
     """A solid of revolution about z' under a profile curve.
 
     Parameters
@@ -177,7 +164,7 @@ def _touches_itself(points: NDArray[np.float64]) -> bool:
 Upper = Annotated[Cylinder | Cone | Sphere | Revolution, Field(discriminator="kind")]
 
 
-class LandmarkSpec(_Spec):
+class LandmarkSpec(FieldTable):
     """A landmark: a box, and on its centre a solid of revolution (PHYSICS sections 1 and 5).
 
     Parameters

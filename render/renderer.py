@@ -8,7 +8,6 @@ import itertools
 import math
 from collections import OrderedDict
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from threading import Lock
@@ -36,6 +35,7 @@ from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.rigid import product
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS, Views
 
 Variant = Literal["exact", "hard"]
@@ -531,12 +531,8 @@ class Renderer:
         )
         views_per_task = 64
         tasks = [slice(i, min(i + views_per_task, len(views))) for i in range(0, len(views), views_per_task)]
-        if workers == 1 or len(tasks) <= 1:
-            run(tasks, ordered, behind, camera, light, sums)
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                lanes = [tasks[i::workers] for i in range(workers)]
-                list(pool.map(lambda lane: run(lane, ordered, behind, camera, light, sums), lanes))
+        lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
+        mapped(lambda lane: run(lane, ordered, behind, camera, light, sums), lanes, workers)
         untrusted = int((sums.state == UNTRUSTED).sum())
         with _COUNTING:
             self.untrusted_pixels += untrusted

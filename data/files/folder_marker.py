@@ -119,14 +119,12 @@ class OwnedFiles:
     folder : Path
     content : str
         What the folder holds, for the marker.
-    adopted : set of str
-        What is ours in a folder that was written before there were markers.
     """
 
-    def __init__(self, folder: Path, content: str, adopted: set[str]) -> None:
+    def __init__(self, folder: Path, content: str) -> None:
         marked, listed = read_marker(folder)
         self.folder, self._content = folder, content
-        self.names = (listed or set()) if marked else adopted
+        self.names = (listed if marked else None) or set()
 
     def claim(self, *names: str) -> None:
         """Note that files are ours before they are written.
@@ -155,7 +153,7 @@ class OwnedFiles:
 
 
 @contextmanager
-def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) -> Iterator[OwnedFiles]:
+def adding_to_folder(folder: Path, content: str) -> Iterator[OwnedFiles]:
     """Lock a folder against other runs while the block adds files to it.
 
     A block that fails before it has added one leaves nothing: no marker, and no folder that was made for it.
@@ -166,8 +164,6 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
         It is made if it is not there.
     content : str
         The command that writes it, for marker and messages.
-    adopted : iterable of str
-        As for :class:`OwnedFiles`.
 
     Raises
     ------
@@ -182,7 +178,7 @@ def adding_to_folder(folder: Path, content: str, adopted: Iterable[str] = ()) ->
         for name in filter(is_marker_part, os.listdir(folder)):  # of a run that was killed
             (folder / name).unlink(missing_ok=True)
         marked = os.path.lexists(folder / MARKER)
-        ours = OwnedFiles(folder, content, set(adopted))
+        ours = OwnedFiles(folder, content)
         try:
             yield ours
         except BaseException:

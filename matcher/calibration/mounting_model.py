@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,6 +26,7 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.lens_map import distort
 from phasemark.render.sensor.lens_rates import lens_rates
+from phasemark.render.threads import mapped
 
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
@@ -334,8 +334,7 @@ class CalibrationModel:
         exact = {"range_offset", *by_time, *(("albedo",) if on == "phasors" else ())}
         wanted = dict.fromkeys(own.get(name, name) for name in (*names, *(POSE if by_time else ())))
         rendered = [name for name in wanted if name not in exact]
-        with ThreadPoolExecutor(self.workers) as pool:
-            found = dict(zip(rendered, pool.map(difference, rendered), strict=True))
+        found = dict(zip(rendered, mapped(difference, rendered, self.workers), strict=True))
         found |= {name: found[same] for name, same in own.items() if same in found}
         if by_time:
             moving = np.einsum("ks,skr->kr", self.poses_at(theta)[1], np.stack([found[name] for name in POSE]))

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,6 +37,7 @@ from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
 from phasemark.render import predicted_range_std
 from phasemark.render.sensor.sensor_file import rounded
+from phasemark.render.threads import mapped
 
 _CLEAR = 1.5
 """Phasors count where the noise of one frame is below its limit by this factor: nearer to the limit a frame's own noise
@@ -527,8 +527,7 @@ class StillFit:
         def stepped(step: NDArray[np.float64]) -> Place:
             return self._stepped(place, wide, own_gradient, step)
 
-        with ThreadPoolExecutor(self.model.workers) as pool:
-            costs = list(pool.map(lambda step: stepped(step).cost, steps))
+        costs = mapped(lambda step: stepped(step).cost, list(steps), self.model.workers)
         descended = [
             self._follow(stepped(steps[k]), wide, _SEARCH_SETTLED)
             for k in np.argsort(costs, kind="stable")[:_SEARCH_FROM]

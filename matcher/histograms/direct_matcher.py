@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from typing import Literal, TypeVar
+from collections.abc import Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +14,6 @@ from phasemark.data import Bank
 from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, plan_table
 from phasemark.matcher.histograms.scene_models import planes_of
-from phasemark.matcher.match import Match
 from phasemark.render import Background, Sensor
 from phasemark.render.direct.bin_counts import response_share
 from phasemark.render.direct.footprints import histogram_of
@@ -24,7 +22,6 @@ from phasemark.render.view import VIEW_FIELDS
 
 _WIDEST_BEARING_RAD = math.radians(4.0)
 _STEEPEST_RAD = math.radians(20.0)
-_T = TypeVar("_T")
 
 
 class DirectMatcher:
@@ -78,13 +75,6 @@ class DirectMatcher:
         bearing_sigma = 2.0  # A free bearing has two further tables of histograms, as far aside as these say.
         side = min(bearing_sigma * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
         return (0.0, -side, side)
-
-    def _on_threads(self, work: Callable[[_T], Match], frames: Sequence[_T]) -> list[Match]:
-        """Return the answer for each frame."""
-        if self.workers == 1 or len(frames) < 2:
-            return [work(one) for one in frames]
-        with ThreadPoolExecutor(self.workers) as pool:
-            return list(pool.map(work, frames))
 
 
 def check_histogram_sensor(bank: Bank) -> None:

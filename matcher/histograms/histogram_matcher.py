@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from phasemark.matcher.match import Match
 from phasemark.render import Background
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
 _SAME_M, _SAME_RAD = 0.02, math.radians(5.0)
@@ -41,7 +41,7 @@ class HistogramMatcher(HistogramSearch):
     def match(self, frames: HistogramFrames) -> list[Match]:
         """Return an answer for every position of the bank's sensor, whose frames are added up."""
         self.prepare()
-        return self._on_threads(self._match, _counted(frames))
+        return mapped(self._match, _counted(frames), self.workers)
 
     def _match(self, frame: Counted) -> Match:
         starts, bare = self.looked(frame)
@@ -79,8 +79,7 @@ class HistogramMatcher(HistogramSearch):
         """
         counted = _counted(frames)
         self.prepare()
-        with ThreadPoolExecutor(self.workers) as pool:
-            found, bare = zip(*pool.map(self.looked, counted), strict=True)
+        found, bare = zip(*mapped(self.looked, counted, self.workers), strict=True)
         begin = self._joint_starts(found, first2camera)
         if not begin:
             return no_answer(self.rules)

@@ -35,6 +35,7 @@ from phasemark.render.direct.expected_targets import ExpectedTargets, expected_t
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.targets import Status, Targets
 from phasemark.render.direct.view_signals import STEPS, views_about
+from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
 _ASIDE_RAD = math.radians(6.0)
@@ -138,7 +139,7 @@ class TargetMatcher(DirectMatcher):
                 f" {self.sensor.cols}"
             )
         _ = self.table, self._still  # rendered before threads ask for them
-        return self._on_threads(self._match, [self._reported(targets, k) for k in range(len(targets.distance_m))])
+        return mapped(self._match, [self._reported(targets, k) for k in range(len(targets.distance_m))], self.workers)
 
     def _reported(self, targets: Targets, k: int) -> Reported:
         """Return the targets of one position, in a list."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cached_property
 from typing import Literal
@@ -42,6 +41,7 @@ from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, counts
 from phasemark.render import Background, PhasorImages, Renderer, Views
 from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.threads import mapped
 
 __all__ = ["BEARING_STD_RAD", "ROBUST_FROM", "TILT_STD_RAD", "LikelihoodMatcher", "Pixels", "usual_workers"]
 
@@ -151,12 +151,7 @@ class LikelihoodMatcher:
         share = max(math.ceil(len(frames) / self._workers), 1)
         share = min(share, self._setup.policy.frames_at_once, max(_PIXELS_AT_ONCE // self._setup.used.size, 1))
         parts = [frames[start : start + share] for start in range(0, len(frames), share)]
-        if len(parts) < 2 or self._workers == 1:
-            found = [match(part) for part in parts]
-        else:
-            with ThreadPoolExecutor(self._workers) as pool:
-                found = list(pool.map(match, parts))
-        answers = [answer for some in found for answer in some]
+        answers = [answer for some in mapped(match, parts, self._workers) for answer in some]
         if "motion" not in self._systematic:
             return answers
         return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numba
@@ -42,6 +41,7 @@ from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.camera_unit import CameraUnit, camera_unit
 from phasemark.render.sensor.range_noise import phase_image_variance
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
 from phasemark.render.unwrapped_frames import unwrap_frames
 from phasemark.render.view import Views
 
@@ -191,12 +191,7 @@ def _capture_frequency(
             )
 
     runs = list(_cuts(slice(0, shape[0]), _BLOCKS_PER_RUN * per_block))
-    if workers == 1 or len(runs) <= 1:
-        for run in runs:
-            take(run)
-    else:
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(take, runs))
+    mapped(take, runs, workers)
     full = (n_views, n_frames, sensor.rows, sensor.cols)
     return Frames.as_measured(
         range_m.reshape(full),
