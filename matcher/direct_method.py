@@ -18,7 +18,8 @@ from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.likelihood_matcher import usual_workers
 from phasemark.matcher.likelihood.setup import check_free
-from phasemark.matcher.likelihood.systematic import Systematic, declared_covariance, with_motion
+from phasemark.matcher.likelihood.shared_errors import with_motion
+from phasemark.matcher.likelihood.systematic import Systematic, declared_covariance
 from phasemark.matcher.match import Match
 from phasemark.render import Background, Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames

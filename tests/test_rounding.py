@@ -65,7 +65,7 @@ def test_tables_and_reports_round_alike():
     match = Match("cone", True, 1.234, 0.5, covariance=np.diag([0.0002**2, math.radians(0.3) ** 2]))
     assert "1.23400 ± 0.00020" in match._repr_html_()
     assert "28.65 ± 0.30" in match._repr_html_()
-    assert _with_interval(Interval(0.003, 0.00288, 0.00312), 1e3) == "3.00 [2.88, 3.12]"
+    assert _with_interval(Interval(0.003, 0.00288, 0.00312).scaled(1e3)) == "3.00 [2.88, 3.12]"
     assert value_and_error_of(35571.23, FittedField(35571.23, 89.0, "")) == ("35571", "89")
     assert value_and_error_of(0.5, FittedField(0.5, 0.0002, "")) == ("0.50000", "0.00020")
     assert value_and_error_of(0.5, FittedField(0.5, None, "")) == ("0.5", "assumed")

@@ -30,8 +30,9 @@ from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.likelihood.search import search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import Scene, Setup, check_free
+from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
 from phasemark.matcher.likelihood.strip_images import StripModel
-from phasemark.matcher.likelihood.systematic import Systematic, with_motion, with_shared_errors
+from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, Upward

@@ -9,26 +9,16 @@ sensor declares beside that (`systematic_distance_m` and its neighbours) is adde
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.estimate.acceptance import with_part, with_parts
-from phasemark.matcher.filters.stamps import spread_stamps
-from phasemark.matcher.information import covariance_of
-from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.rendered_images import RenderedModel
-from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
-from phasemark.matcher.likelihood.setup import Setup
-from phasemark.matcher.match import Match
-from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import LENS_FIELD
 from phasemark.render.sensor.lens_rates import lens_rates
-from phasemark.render.view import delta_period_rad
 
 Systematic = Literal["calibration", "declared", "motion"]
 """What a calibration leaves of the sensor's fields, what the sensor declares of a pose, and the jitter of stamps."""
@@ -60,120 +50,6 @@ def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
         if name not in SYSTEMATICS:
             raise UsageError(f"'systematic' must be among {', '.join(SYSTEMATICS)}, got {name!r}")
     return tuple(name for name in SYSTEMATICS if name in names)
-
-
-def with_shared_errors(
-    setup: Setup,
-    rendered: Callable[[], RenderedModel],
-    systematic: Collection[Systematic],
-    sensor: Sensor,
-    evidence: Evidence,
-    answers: list[Match],
-) -> list[Match]:
-    """Add what the calibration of a sensor leaves, and what the sensor declares.
-
-    Parameters
-    ----------
-    setup : Setup
-    rendered : callable
-        Returns what renders the landmarks; called where a calibration has to be carried into a view.
-    systematic : collection of {"calibration", "declared", "motion"}
-    sensor : Sensor
-        Of the frames.
-    evidence : Evidence
-    answers : list of Match
-        One for each frame; refused as "undetermined" where they no longer are within the tolerance.
-    """
-    parts: list[dict[str, NDArray[np.float64]]] = [{} for _ in answers]
-    known = [k for k, match in enumerate(answers) if match.covariance is not None and match.class_name is not None]
-    declared = declared_covariance(sensor, setup.free)
-    if "declared" in systematic and declared.any():
-        for k in known:
-            parts[k]["declared"] = declared
-    if "calibration" in systematic and calibrated_fields(sensor):
-        for c, name in enumerate(setup.rules.names):
-            which = [k for k in known if answers[k].class_name == name]
-            if which:
-                carried = _carried(setup, rendered(), sensor, evidence, c, which, [answers[k] for k in which])
-                for k, part in zip(which, carried, strict=True):
-                    parts[k]["calibration"] = part
-    return [with_parts(setup.rules, match, part) if part else match for match, part in zip(answers, parts, strict=True)]
-
-
-def with_motion(
-    free: tuple[str, ...], jitter_s: float, time_s: NDArray[np.float64] | None, answers: list[Match]
-) -> list[Match]:
-    """Add what the jitter of the stamps makes of the motion of the camera.
-
-    What a frame shows is as certain as before, so that no further answer is refused.
-
-    Parameters
-    ----------
-    free : tuple of str
-        Parameters of the view.
-    jitter_s : float
-        Standard deviation of the stamps.
-    time_s : (n,) float64, optional
-        Stamps.
-    answers : list of Match
-        One for each of n frames.
-    """
-    if jitter_s == 0 or time_s is None:
-        return answers
-    view, std = (np.full((len(answers), len(free)), np.nan) for _ in range(2))
-    for k, match in enumerate(answers):
-        if match.covariance is not None and match.class_name is not None:
-            view[k] = [getattr(match, name) for name in free]
-            std[k] = np.sqrt(np.diag(match.covariance))
-    period = np.array([delta_period_rad(match.symmetry) for match in answers])
-    rate = rates_of_views(spread_stamps(time_s), view, std, period, free.index("delta_rad"))
-    return [
-        with_part(match, "motion", part) if one.any() else match
-        for match, one, part in zip(answers, rate, jitter_s**2 * rate[:, :, None] * rate[:, None], strict=True)
-    ]
-
-
-def _carried(
-    setup: Setup,
-    model: RenderedModel,
-    sensor: Sensor,
-    evidence: Evidence,
-    class_index: int,
-    which: list[int],
-    matches: list[Match],
-) -> NDArray[np.float64]:
-    """Return what a calibration leaves of the views of some frames with one class and background, (k, p, p)."""
-    background, renderer = matches[0].background, model.renderer(class_index)
-    views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
-    image = renderer.render_views(views, background=background)
-    slope = renderer.jacobian(
-        *(getattr(views, name) for name in VIEW),
-        background=background, parameters=setup.free,
-    )  # fmt: skip
-    if setup.on == "phasors":  # the albedo, which is fitted too, takes up part of an error
-        alone = image if background is None else renderer.render_views(views)
-        slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
-    by_fields = calibrated_slopes(renderer, sensor, views, image, background)
-    use = counts(image.phasor, image.intensity, sensor).reshape(len(which), -1) & setup.used
-    weight = np.where(use, evidence.weight[which], 0.0)
-    phasor = image.phasor.reshape(len(which), -1)
-    if setup.unknown:
-        residual = range_residuals(phasor, evidence, which)
-        weight = np.where(weight * residual**2 > STRANGE_SIGMA**2, 0.0, weight)
-
-    def whitened(slopes: NDArray[np.complex128]) -> NDArray[np.float64]:
-        flat, root = slopes.reshape(*slopes.shape[:2], -1), np.sqrt(weight)[:, None]
-        if setup.on == "phasors":
-            return np.concatenate([flat.real * root, flat.imag * root], axis=2)
-        return np.asarray(range_slopes(phasor, flat, sensor) * root)
-
-    rows = whitened(slope)
-    information = rows @ rows.transpose(0, 2, 1)
-    p = len(setup.free)
-    if setup.prior_std:
-        information[:, :p, :p] += np.diag(np.array(setup.prior_std) ** -2.0)
-    inverse = covariance_of(information, weak="none")
-    return carried_covariance(inverse, rows, whitened(by_fields), calibrated_covariance(sensor))[:, :p, :p]
 
 
 def declared_covariance(sensor: Sensor, free: Sequence[str]) -> NDArray[np.float64]:
