@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import io
 import os
 from collections.abc import Sequence
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError, __version__
 from phasemark.data.files.atomic_write import replacing, write_atomically
-from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.seeds import stream
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
 from phasemark.render.direct import HistogramRenderer
@@ -254,9 +253,5 @@ def _csv(recording: SimulatedRecording, told: str) -> str:
     for name, values in _truth(recording.views).items():
         columns[name] = [f"{value:.9g}" for value in values]
     columns["truth_class"] = [recording.class_name] * n
-    text = io.StringIO()
-    text.write(f"# {told} unit={unit} quantity={quantity}\n")
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(map(as_cell, row) for row in zip(*columns.values(), strict=True))
-    return text.getvalue()
+    table = csv_text([tuple(columns), *zip(*columns.values(), strict=True)])
+    return f"# {told} unit={unit} quantity={quantity}\n{table}"

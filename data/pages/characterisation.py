@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 
 from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
@@ -207,13 +206,15 @@ def _quantity_row(one: SheetQuantity) -> dict[str, str]:
 
 
 def _points_csv(found: Characterisation) -> str:
-    header = ("figure", "label", "x_name", "x", "y_name", "predicted", "simulated", "low95", "high95", "samples")
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, (*header, "compared"), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for one in found.as_dict()["comparisons"]:
-        writer.writerows({**one, **point, "compared": int(point["compared"])} for point in one["points"])
-    return buffer.getvalue()
+    header = (
+        "figure", "label", "x_name", "x", "y_name", "predicted", "simulated", "low95", "high95", "samples", "compared"
+    )  # fmt: skip
+    points = [
+        {**one, **point, "compared": int(point["compared"])}
+        for one in found.as_dict()["comparisons"]
+        for point in one["points"]
+    ]
+    return csv_text([header, *([point.get(name) for name in header] for point in points)])
 
 
 def _length(metres: float) -> str:

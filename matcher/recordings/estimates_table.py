@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
-from phasemark.data.files.csv_cell import as_cell
+from phasemark.data.files.csv_cell import csv_text, nine_digits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match, Matches, named_in_degrees, scale_of_degrees
 from phasemark.matcher.matcher import Matcher
@@ -115,9 +112,7 @@ class EstimateTable:
 
     def to_csv(self) -> str:
         """Return the table with its header."""
-        text = io.StringIO()
-        csv.writer(text, lineterminator="\n").writerows(map(_cell, row) for row in self._rows)
-        return text.getvalue()
+        return csv_text([nine_digits(value) for value in row] for row in self._rows)
 
     def _numbers(self, match: Match) -> list[float]:
         """Return each parameter of a match with its standard deviation, and their correlations."""
@@ -132,10 +127,3 @@ class EstimateTable:
         unit = np.array([scale_of_degrees(name) for name in self._free])
         pairs = np.stack([unit * values, unit * std], axis=1).ravel().tolist()
         return [*pairs, *correlation[np.triu_indices(size, 1)].tolist()]
-
-
-def _cell(value: object) -> object:
-    """Return a value as a cell, empty if there is nothing to say."""
-    if isinstance(value, float):
-        return f"{value:.9g}" if math.isfinite(value) else ""
-    return "" if value is None else as_cell(value)
