@@ -409,7 +409,7 @@ def test_the_zone_sensor_is_fitted_and_objects_are_located_by_histograms(tmp_pat
 def test_the_simulated_recording_is_what_its_command_writes(tmp_path):
     kept = EXAMPLE.parent / "simulated_cone.csv"
     stated = (EXAMPLE.parent.parent / "docs" / "tutorials.md").read_text(encoding="utf-8")
-    options = stated.split("`examples/simulated_cone.csv` is one that it wrote, with `")[1].split("`")[0].split()
+    options = stated.split("it wrote `examples/simulated_cone.csv` with `")[1].split("`")[0].split()
     command = ["frames", "simulate", *options, "--sensor", "vl53l5cx-8x8", "--out", str(tmp_path / "again.csv")]
     assert main(command) == 0
     here, there = (path.read_text(encoding="utf-8").splitlines() for path in (kept, tmp_path / "again.csv"))
