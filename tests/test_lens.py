@@ -211,6 +211,10 @@ def test_half_angles_and_principal_point_follow_from_the_lens():
     assert wider.half_angle_v_deg == pytest.approx(sensor.half_angle_v_deg, rel=1e-3)  # tangential terms alone
     assert wider.lens.fx < sensor.lens.fx
     assert sensor.with_(principal_point_px=(16.0, 12.0)).lens.cx == 15.5
+    with pytest.raises(UsageError, match="'half_angle_h_deg' must be greater than 0, got 0"):
+        sensor.with_(half_angle_h_deg=0)
+    with pytest.raises(UsageError, match=r"'principal_point_px\.1' is missing"):
+        sensor.with_(principal_point_px=[1])
 
 
 PLAIN = {"fx": 60, "fy": 60, "cx": 16, "cy": 12}

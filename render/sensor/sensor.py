@@ -185,10 +185,12 @@ class Sensor(SensorQuantities):
             fields = {name: value for name, value in fields.items() if name not in DERIVED or name in asked}
             differ = {name: value for name, value in asked.items() if value != getattr(self, name)}
             if self.lens is not None and "lens" not in changes and differ:
+                # numbers that are none are refused by their names
+                Sensor(**{**self.model_dump(), **changes, "lens": None})
                 fields = {name: value for name, value in fields.items() if name not in asked}
                 try:
                     fields["lens"] = changed_lens(self.lens, fields["rows"], fields["cols"], differ)
-                except (TypeError, ValueError) as error:
+                except ValueError as error:
                     raise UsageError(str(error)) from None
         return Sensor(**fields)
 
