@@ -12,8 +12,7 @@ from typing import Any
 def csv_text(rows: Iterable[Sequence[Any]]) -> str:
     """Return rows as CSV, text as :func:`as_cell` has it."""
     text = io.StringIO()
-    plain = ([as_cell(one) if isinstance(one, str) else one for one in row] for row in rows)
-    csv.writer(text, lineterminator="\n").writerows(plain)
+    csv.writer(text, lineterminator="\n").writerows([as_cell(value) for value in row] for row in rows)
     return text.getvalue()
 
 

@@ -209,7 +209,7 @@ def read_poses(
     ]
     if not lines:
         raise InputFileError(f"{path}: is empty; its columns must be {COLUMNS}")
-    separator = next((one for one in ";\t" if one in lines[0][1]), ",")
+    separator = next((sign for sign in ";\t" if sign in lines[0][1]), ",")
     (_, header), *table = [(where, cells_of(line, where, separator)) for where, line in lines]
     names = [name.strip() for name in header]
     is_polar = _check_header(path, names)

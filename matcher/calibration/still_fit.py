@@ -56,7 +56,7 @@ _SEARCH_FROM, _SEARCH_SETTLED = 3, 0.03
 _WIDTHS = (0.5, 1.0, 2.0)
 """Standard deviations over which slopes are taken for the covariance."""
 _SEARCHES, _GAINED = 4, 0.1
-"""How often the search is repeated about what it found, unless it saved less."""
+"""Maximum number of repeated searches; stop when the cost falls by less than `_GAINED`."""
 FALSE_ALARM = 0.01
 """A fit whose χ² is exceeded with less than this probability does not fit."""
 _POSES_FOR_ERRORS, _ROUNDS = 6, 2
@@ -424,7 +424,7 @@ class StillFit:
         evidence = self.evidence
         root = np.sqrt(np.where(use, evidence.weight, 0.0))
         if evidence.on == "ranges":
-            # what the model has left since the pixels were chosen disagrees, at a price that no move can lower to none
+            # a chosen pixel that the model no longer sees costs DISAGREEMENT, whatever the step
             lost = np.where(use, math.sqrt(DISAGREEMENT), 0.0)
             return np.where(images.phasor == 0, lost, range_residual(evidence, images) * root)
         difference = (evidence.value - images.phasor) * root

@@ -178,7 +178,7 @@ def fit_view(
     inner_done = 1e-2  # squared standard deviations
     # A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it.
     near_enough = 0.7
-    worse = 0.5  # A scene may be so much worse than the linear one that led to it: less than what a test can see.
+    worse = 0.5  # Accept a scene whose cost exceeds its linear prediction by at most this: no test can see less.
     for _ in range(most):
         here = _linear_scene(search, frame, state, bright, ambient)
         if best is not None and here.cost > best.cost + worse:

@@ -79,8 +79,8 @@ class ImageModel(ABC):
     def of_frames(self, frame: NDArray[np.int64]) -> ImageModel:
         """Return the model whose views are those of some frames (m,), each before what stands behind it there.
 
-        A model with one background for all frames returns itself, and takes any number of views. One with several
-        makes images only after this call, of m views at a time or of parts that are said to it the same way.
+        A model with one background for all frames returns itself, and takes any number of views. A model with one
+        background per frame must be bound to the frames by this call before it makes images.
         """
         return self
 

@@ -121,7 +121,7 @@ def slopes_around(
         slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
         if slope is None:
             return None
-        # light that comes and goes within the step has no phase whose slope could tell anything
+        # ignore pixels that are lit at one end of the step only: their phase slope is meaningless
         phasor = np.abs(state.images.phasor[which])[:, None]
         return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
     by_view = problem.at_brightness(
@@ -136,8 +136,8 @@ def slopes_along_axes(
 ) -> NDArray[np.complex128]:
     """Return slopes over half a standard deviation to either side along the axes of covariances, (m, p, pixels).
 
-    A height and a pitch nearly cancel. Differences along each of them alone would average over different kinks, and
-    leave of their sum more than there is: information about what hardly changes the image.
+    A height and a pitch nearly cancel. Separate differences average over different kinks and overstate the
+    information in the combination.
     """
     p = covariance.shape[1]
     scale, (std, vectors) = problem.scale[:p], _axes(problem, covariance)
