@@ -33,11 +33,11 @@ DIRECT_KINDS = ("histograms", "targets")
 
 def refuse_direct_options(
     method: str, on: str, background: Background | Literal["auto", "unknown", "any"] | None, pixels: str, robust: bool,
-    calibration: bool, policy: bool,
+    systematic: Collection[str], policy: bool,
 ) -> None:  # fmt: skip
     """Refuse options that do not go with histograms and targets.
 
-    `calibration` and `policy` are whether that was asked for.
+    `systematic` was asked for, `policy` says whether one was.
 
     Raises
     ------
@@ -51,7 +51,10 @@ def refuse_direct_options(
         and background == "auto",
         "'pixels' must be all": pixels != "all",
         "'robust' must be False": robust,
-        "'systematic' must be without 'calibration', which is carried into ranges and phasors alone": calibration,
+        **{
+            f"'systematic' must be without '{term}', which is carried into ranges and phasors alone": term in systematic
+            for term in ("calibration", "recording")
+        },
         "'policy' must be None, for it steers the search in ranges and phasors alone": policy,
     }
     for problem, is_wrong in wrong.items():
@@ -130,7 +133,7 @@ def with_direct_errors(
     Parameters
     ----------
     rules : Rules
-    systematic : collection of {"calibration", "declared", "motion"}
+    systematic : collection of {"calibration", "recording", "declared", "motion"}
     sensor : Sensor
         Of the frames.
     time_s : (n, frames) float64, optional

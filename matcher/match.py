@@ -93,8 +93,8 @@ class Match:
     among_unknown : bool
         Whether other things might stand before, beside and behind the landmark.
     systematic : mapping of str to ndarray
-        What of `covariance` all frames of the camera share, by its cause: "calibration" and "declared". The rest is
-        noise.
+        What of `covariance` all frames of the camera share, by its cause: "calibration", "recording", "declared",
+        "motion". The rest is noise.
     may_be_mirrored : bool or None
         Of an accepted answer of the method `refine`, whether the frame mirrored left to right may be a frame of the
         bank too: then nothing in it shows whether the image is mirrored, as reading it the wrong way leaves it, and δ

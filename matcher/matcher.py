@@ -36,7 +36,7 @@ from phasemark.matcher.likelihood.likelihood_matcher import (
 )
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import check_free
-from phasemark.matcher.likelihood.systematic import SYSTEMATICS, check_systematic
+from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors, check_systematic
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.one_frequency import OneFrequency
@@ -104,10 +104,11 @@ class Matcher:
         How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
         0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
         image.
-    systematic : collection of {"calibration", "declared", "motion"}, optional
+    systematic : collection of {"calibration", "recording", "declared", "motion"}, optional
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
-        of the frames' sensor leaves, what the sensor declares of a pose, and what the jitter of its stamps makes of
-        the camera's motion. None: all; of histograms and targets all but what a calibration leaves.
+        of the frames' sensor leaves, what differs in another recording than those that calibrated it, what the sensor
+        declares of a pose, and what the jitter of its stamps makes of the camera's motion. None: all; of histograms and
+        targets the last two.
     tolerance_m, tolerance_rad : float
         How far off an accepted answer may be. An answer is refused as "undetermined" where the frame leaves a free
         length or angle open by more than this, and as "ambiguous" where another class, or a view farther away than
@@ -210,8 +211,7 @@ class Matcher:
         self._direct: HistogramMatcher | TargetMatcher | None = None
         self.free: tuple[str, ...] = VIEW[:2]
         if on in DIRECT_KINDS:
-            calibration = systematic is not None and "calibration" in self._systematic
-            refuse_direct_options(method, on, background, pixels, robust, calibration, policy is not None)
+            refuse_direct_options(method, on, background, pixels, robust, systematic or (), policy is not None)
             behind = cast(Background | Literal["auto"] | None, background)
             known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
             if free is None:
@@ -389,11 +389,11 @@ class Matcher:
 
     def _of_one_frequency(self, frames: FilteredFrames, one: OneFrequency) -> FilteredFrames:
         """Return the frames that a camera of one frequency would have measured in place of the camera of several."""
-        if one.stacked and self.method == "refine" and "calibration" in self._systematic:
-            if names := frames.sensor.calibration_fields:
+        if one.stacked and self.method == "refine":
+            for term, left in carried_errors(frames.sensor, self._systematic).items():
                 raise UsageError(
-                    f"what a calibration leaves of '{names[0]}' is carried over on unwrapped ranges alone with several"
-                    " modulation frequencies: leave \"calibration\" out of 'systematic'"
+                    f"what a {term} leaves of '{left.fields[0]}' is carried over on unwrapped ranges alone with several"
+                    f" modulation frequencies: leave \"{term}\" out of 'systematic'"
                 )
         return one.frames(frames)
 

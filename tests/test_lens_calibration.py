@@ -300,7 +300,7 @@ def test_slopes_by_terms_of_a_lens_are_those_of_frames_made_with_another_lens(ki
     renderer = Renderer(trimesh.creation.box((0.01, 20.0, 20.0)), sensor, albedo=0.8)
     views = Views.broadcast(1.0, 0.2, 0.0, 0.0)
     image = renderer.render_views(views)
-    slopes = calibrated_slopes(renderer, sensor, views, image, None)
+    slopes = calibrated_slopes(renderer, sensor, views, image, None, sensor.calibration_fields)
     found = sensor.metres_per_radian * (slopes[0] / image.phasor[0]).imag
     for k, name in enumerate(FIELDS[:4]):
         step = 1e-5

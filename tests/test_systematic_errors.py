@@ -44,7 +44,7 @@ def test_slopes_by_calibrated_fields_are_those_of_frames_made_with_other_fields(
     renderer = Renderer(bank.mesh("cone"), sensor, albedo=0.8)
     views = Views.broadcast(1.013, 0.7, 0.0, 0.0)
     image = renderer.render_views(views, background=background)
-    slopes = calibrated_slopes(renderer, sensor, views, image, background)
+    slopes = calibrated_slopes(renderer, sensor, views, image, background, sensor.calibration_fields)
     inside = (image.coverage[0] > 0.999) | (image.coverage[0] < 1e-4)  # no edge, whose slope is another over each step
     for k, (name, step) in enumerate(zip(FIELDS, (1e-3, 1e-3, 1e-3, 1e-3, 1e-5), strict=True)):
         other = sensor.with_(**{name: getattr(sensor, name) + step})
@@ -163,5 +163,7 @@ def test_the_bound_carries_the_same_terms(bank):
 
 
 def test_unknown_terms_are_named(bank):
-    with pytest.raises(UsageError, match="'systematic' must be among calibration, declared, motion, got 'noise'"):
+    with pytest.raises(
+        UsageError, match="'systematic' must be among calibration, recording, declared, motion, got 'noise'"
+    ):
         Matcher(bank, "refine", systematic=("noise",))

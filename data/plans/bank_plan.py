@@ -64,6 +64,10 @@ _YOUNGER_FIELDS = {
     "systematic_bearing_deg",
     "systematic_height_m",
     "systematic_time_s",
+    "recording_range_m",
+    "recording_pitch_deg",
+    "recording_roll_deg",
+    "recording_bearing_deg",
 }
 """Of a sensor: what resolved plans in older files lack, and mean 0 or none by."""
 

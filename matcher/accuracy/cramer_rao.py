@@ -18,12 +18,12 @@ from phasemark import UsageError
 from phasemark.matcher.information import covariance_of, eliminated
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.systematic import (
-    calibrated_covariance,
-    calibrated_fields,
     calibrated_slopes,
-    carried_covariance,
+    carried_covariances,
+    carried_errors,
     check_systematic,
     declared_covariance,
+    fields_of,
 )
 from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.matcher.pixel_agreement import counts, pixel_mask
@@ -120,8 +120,9 @@ def cramer_rao(
     nuisances : sequence of str, optional
         Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges. Of histograms
         "wall_m" alone can be named, for brightness is unknown anyway.
-    systematic : collection of {"calibration", "declared"}
-        Which errors of the sensor that all frames share are added: what its calibration leaves, and what it declares.
+    systematic : collection of {"calibration", "recording", "declared"}
+        Which errors of the sensor that all frames share are added: what its calibration leaves, what differs in another
+        recording, and what it declares.
     workers : int
         Threads.
 
@@ -171,8 +172,8 @@ def cramer_rao(
     if len(renderer.sensor.frequencies_hz) > 1:
         one = OneFrequency(renderer.sensor, "stacked")
         renderer = OneFrequencyRenderer(renderer, one)
-        if "calibration" in systematic and calibrated_fields(one.camera):
-            raise UsageError('systematic="calibration" takes a sensor of one modulation frequency')
+        if terms := carried_errors(one.camera, systematic):
+            raise UsageError(f'systematic="{next(iter(terms))}" takes a sensor of one modulation frequency')
     sensor = renderer.sensor
     image, slope = _image_and_slopes(renderer, views, free, background, workers)
     columns = [slope]
@@ -208,17 +209,17 @@ def cramer_rao(
     everything = rows @ rows.transpose(0, 2, 1)
     information = eliminated(everything, len(free))
     common = None
-    if terms := check_systematic(systematic):
+    if chosen := check_systematic(systematic):
         common = np.zeros(information.shape)
-        if "declared" in terms:
+        if "declared" in chosen:
             common += declared_covariance(sensor, free)
-        if "calibration" in terms and calibrated_fields(sensor):
-            by_fields = calibrated_slopes(renderer, sensor, views, image, background, workers)
-            calibrated = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
+        if terms := carried_errors(sensor, chosen):
+            by_fields = calibrated_slopes(renderer, sensor, views, image, background, fields_of(terms), workers)
+            whitened = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
             # nuisances included: they take up part of an error
             known = np.nan_to_num(covariance_of(everything, weak_share=_WEAK_SHARE))
             p = len(free)
-            common += carried_covariance(known, rows, calibrated, calibrated_covariance(sensor))[:, :p, :p]
+            common += sum(part[:, :p, :p] for part in carried_covariances(known, rows, whitened, terms).values())
     if one is not None:
         use = one.layers(use).any(axis=-3)
     return Bound(tuple(free), information, use, common)

@@ -21,8 +21,9 @@ from phasemark.matcher.match import named_in_degrees
 from phasemark.render import Background, Renderer, Views, predicted_range_std
 
 EDGES, FACES = "noise of edge pixels", "noise of face pixels"
-CALIBRATION, DECLARED = "calibration of the sensor", "systematic errors declared by the sensor"
-SOURCES = (EDGES, FACES, CALIBRATION, DECLARED)
+CALIBRATION, RECORDING = "calibration of the sensor", "what differs from one recording to the next"
+DECLARED = "systematic errors declared by the sensor"
+SOURCES = (EDGES, FACES, CALIBRATION, RECORDING, DECLARED)
 """What the variance of a pose comes from. An edge pixel is covered by the landmark in part."""
 _WEAK_SHARE = 1e-13
 _WHOLE = 1e-6  # of a pixel: coverage is exact but for rounding
@@ -221,15 +222,14 @@ def accuracy_card(
     others = dict(others or {})
 
     bound = partial(cramer_rao, renderer, views, free=free, n_frames=n_frames, background=background)
-    calibrated, declared = bound(systematic=("calibration",)), bound(systematic=("declared",))
+    shared = [bound(systematic=(term,)) for term in ("calibration", "recording", "declared")]
+    declared = shared[-1]
     noise = covariance_of(declared.information, weak_share=_WEAK_SHARE)
     coverage = renderer.render_views(views, background=background).coverage
     edge = (coverage > _WHOLE) & (coverage < 1 - _WHOLE)
     of_edges = noise @ bound(pixels=declared.pixels & edge).information @ noise
-    assert calibrated.systematic is not None
-    assert declared.systematic is not None
-    every = (of_edges, noise - of_edges, calibrated.systematic, declared.systematic)
-    parts = dict(zip(SOURCES, every, strict=True))
+    common = [np.zeros_like(noise) if one.systematic is None else one.systematic for one in shared]
+    parts = dict(zip(SOURCES, (of_edges, noise - of_edges, *common), strict=True))
     error = np.full(len(views), np.nan)
     if others:
         squares = class_distances_squared(renderer, views, others, n_frames=n_frames, background=background)

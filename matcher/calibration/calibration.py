@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Literal
 
 import trimesh
 
 from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
-from phasemark.matcher.calibration.judgement import doubts_about, likely_cause
+from phasemark.matcher.calibration.judgement import cause_of_refusal, doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, Mounting, check_names
 from phasemark.matcher.calibration.problem import Problem
@@ -30,8 +31,8 @@ from phasemark.render import Background, Sensor
 
 def calibrate(
     mesh: trimesh.Trimesh,
-    frames: FilteredFrames,
-    poses: KnownPoses,
+    frames: FilteredFrames | Sequence[FilteredFrames],
+    poses: KnownPoses | Sequence[KnownPoses],
     *,
     free: Sequence[str] | None = None,
     fixed: Sequence[str] = (),
@@ -58,11 +59,12 @@ def calibrate(
     ----------
     mesh : trimesh.Trimesh
         The landmark.
-    frames : FilteredFrames
+    frames : FilteredFrames or sequence of FilteredFrames
         One for each pose; their sensor is the camera before the calibration. For phasors best from
-        :func:`~phasemark.matcher.phasor_mean`.
-    poses : KnownPoses
-        Known poses of the camera.
+        :func:`~phasemark.matcher.phasor_mean`. Of a moving camera several recordings may be given: each then has small
+        errors of its own in range offset, bearing, pitch, roll and delay, whose sizes are estimated too.
+    poses : KnownPoses or sequence of KnownPoses
+        Known poses of the camera; of several recordings in their order.
     free : sequence of str, optional
         What to estimate: :data:`NAMES`, and of a sensor with a lens fx, fy, cx, cy and the coefficients that it states
         (all of them: ``lens``) in place of half angles. None: all of it but the lens. On ranges the albedo is told only
@@ -106,20 +108,19 @@ def calibrate(
         With one line: names or numbers are wrong, frames and poses do not go together, or the poses do not tell what is
         free.
     """
-    one = OneFrequency(frames.sensor, "combined") if len(frames.sensor.frequencies_hz) > 1 else None
+    first, *others = _recordings(frames, poses, moving)
+    camera = first[0].sensor
+    one = OneFrequency(camera, "combined") if len(camera.frequencies_hz) > 1 else None
     recorded = moving or bool(zones)
-    quantity = _quantity(frames, on, recorded)
-    if one is not None:
-        frames = one.frames(frames)
-    sensor = frames.sensor
+    quantity = _quantity(first[0], on, recorded)
+    sensor = camera if one is None else one.frames(first[0]).sensor
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
-    lit = quantity == "phasors" or background is not None or poses.wall_m is not None
+    lit = quantity == "phasors" or background is not None or first[1].wall_m is not None
     usual_renderings = 400  # of all poses: what a progress bar reckons with
-    problem = Problem(
+    problem_of = partial(
+        Problem,
         mesh,
-        frames,
-        poses,
         assumed=_assumed(start, sensor, albedo),
         names=_names(free, fixed, sensor, lit, moving, recorded),
         on=quantity,
@@ -127,12 +128,37 @@ def calibrate(
         reports_z=sensor.quantity == "z" if reports_z is None else reports_z,
         zones=recorded and zones is not False and sensor.kind == "direct",
         workers=workers,
-        rendered=counter(progress, usual_renderings),
+        rendered=counter(progress, usual_renderings * (1 + len(others))),
         one=one,
+        moving=moving,
     )
-    solution = solve_recording(problem, moving=moving) if recorded else solve_still(problem, pose_std)
+    each = [problem_of(own if one is None else one.frames(own), known) for own, known in (first, *others)]
+    problem = replace(each[0], others=tuple(each[1:]))
+    if recorded:
+        try:
+            solution = solve_recording(problem)
+        except UsageError as error:
+            raise UsageError(f"{error}{cause_of_refusal(problem)}") from None
+    else:
+        solution = solve_still(problem, pose_std)
     doubts = doubts_about(solution)
-    return concluded(solution, doubts, likely_cause(solution) if doubts else "")
+    return concluded(solution, doubts, likely_cause(solution, doubts) if doubts else "")
+
+
+def _recordings(
+    frames: FilteredFrames | Sequence[FilteredFrames], poses: KnownPoses | Sequence[KnownPoses], moving: bool
+) -> list[tuple[FilteredFrames, KnownPoses]]:
+    """Return the frames of each recording with its poses; refuse what does not go together."""
+    measured = [frames] if isinstance(frames, FilteredFrames) else list(frames)
+    known = [poses] if isinstance(poses, KnownPoses) else list(poses)
+    if len(measured) != len(known) or not measured:
+        raise UsageError(f"there are {len(measured)} recordings, but poses of {len(known)}: each needs its own")
+    if len(measured) > 1 and not moving:
+        raise UsageError("several recordings are of a moving camera: give moving=True, or the poses as one file")
+    for k, one in enumerate(measured[1:], 2):
+        if one.sensor != measured[0].sensor:
+            raise UsageError(f"recording {k} is of another sensor than the first")
+    return list(zip(measured, known, strict=True))
 
 
 def _quantity(frames: FilteredFrames, on: ResidualKind | Literal["auto"], recorded: bool) -> ResidualKind:

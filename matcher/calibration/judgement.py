@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, clipped, prior_std
 from phasemark.matcher.calibration.mounting_model import natural_units
 from phasemark.matcher.calibration.problem import Problem, Solution
 from phasemark.matcher.calibration.recording_fit import RecordingFit
 
+_Change = Callable[[Problem], Problem]
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""
 _DELAY_NOTED_S, _DELAY_GAIN = 0.015, 0.8
 """A stated delay is doubted if one farther away lowers the mean square residual to that share."""
 _BETTER = 0.5
 """Mean square of the residuals of an alternative, over that of what was assumed, from which it is the likely cause."""
+_FITS_M = 0.02
+"""Root mean square residual below which an alternative fits at all."""
+_FRAMES_TRIED = 120
+_AS, _QUANTITY = "taken as ", "the numbers are likely {right}: give quantity={right}"
+_CLOCKS = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: are both in one clock? state the delay"
+_HALVES = "first", "second"
+_AS_GOOD = 2.0
+"""Mean square residual over the least, up to which alternatives are named together."""
 
 
 def doubts_about(solution: Solution) -> tuple[str, ...]:
@@ -24,7 +39,7 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
     doubts = []
     theta, problem = solution.theta, solution.problem
     assumed, scale = problem.assumed.vector, natural_units(problem.sensor)
-    for name in problem.names:
+    for name in problem.common:
         if name == "albedo":
             continue
         k, one = ALL_NAMES.index(name), PARAMETERS[name]
@@ -42,70 +57,221 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
     most_left_out = 0.5  # share of the pixels on the landmark that may disagree with the model
     if solution.left_out > most_left_out:
         doubts.append(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
-    if problem.track is not None and "delay" not in problem.names:
-        fixed = RecordingFit(problem, edges=solution.edges)
-        freed = RecordingFit(replace(problem, names=(*problem.names, "delay")), edges=solution.edges)
-        with_it, without = freed.approach(), fixed.approach()
-        stated = problem.assumed.delay_s
-        moved = float(with_it[ALL_NAMES.index("delay")]) - stated
-        if abs(moved) >= _DELAY_NOTED_S and freed.misfit(with_it) <= _DELAY_GAIN * fixed.misfit(without):
-            doubts.append(f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * stated:.0f} ms")
+    most_frames_out = 0.15  # share of the frames of which most pixels may disagree
+    if solution.frames_left_out > most_frames_out:
+        doubts.append(f"most pixels of {100 * solution.frames_left_out:.0f} % of the frames disagree with their poses")
+    if problem.track is not None:
+        doubts += _doubts_of_recordings(solution)
     return tuple(doubts)
 
 
-def likely_cause(solution: Solution) -> str:
-    """Return the likely cause of a failure: the change of a stated value that fits best, if it fits much better."""
-    stated = replace(solution.problem, names=tuple(name for name in solution.problem.names if name != "albedo"))
-    best, cause = _BETTER * _misfit(stated, solution.edges)[0], ""
-    for changed, sentence in _alternatives(stated):
-        found, delay_s = _misfit(changed, solution.edges)
-        if found < best:
-            best, cause = found, sentence.format(delay_ms=1e3 * delay_s)
-    return cause or (
-        "no change of delay, quantity or order explains it: are the landmark and its size right, and do the poses refer"
-        " to the lens and the landmark's axis?"
+def _doubts_of_recordings(solution: Solution) -> list[str]:
+    """List doubts about the delays of recordings, about pose errors and about z and range."""
+    doubts, problem = [], solution.problem
+    delays = [own["delay"][1] for own in solution.own if "delay" in own]
+    if "delay" in problem.common:
+        k = problem.common.index("delay")
+        delays = [math.sqrt(float(solution.covariance[k, k]))]
+    unknown_s = 0.05
+    for k, std in enumerate(delays, 1):
+        if std > unknown_s:
+            which = f"recording {k}" if len(delays) > 1 else "this recording"
+            doubts.append(f"the delay cannot be determined from {which} (± {1e3 * std:.0f} ms)")
+    wander_m, wander_rad = 0.02, math.radians(3.0)
+    distance, delta = (math.sqrt(float((solution.pose_shift[:, k] ** 2).mean())) for k in (0, 1))
+    if distance > wander_m or delta > wander_rad:
+        doubts.append(
+            f"frames and poses disagree by {1e3 * distance:.2g} mm in distance and {math.degrees(delta):.2g}° in δ"
+            " (r.m.s.)"
+        )
+    if "delay" not in problem.names:
+        fixed = RecordingFit(problem, edges=solution.edges)
+        freed = RecordingFit(problem.changed(_with_delay), edges=solution.edges)
+        with_it, without = freed.approach(), fixed.approach()
+        stated = problem.assumed.delay_s
+        moved = freed.delay_s(with_it) - stated
+        if abs(moved) >= _DELAY_NOTED_S and freed.misfit(with_it)[0] <= _DELAY_GAIN * fixed.misfit(without)[0]:
+            doubts.append(f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * stated:.0f} ms")
+    if problem.sensor.kind == "direct" and "range_offset" in problem.common:
+        doubts += _doubt_of_quantity(solution)
+    return doubts
+
+
+def _doubt_of_quantity(solution: Solution) -> list[str]:
+    """Doubt that the numbers are z, or ranges, where the other fits as well with a much smaller range offset."""
+    stated = _asked(solution.problem)
+    own = _tried(stated, solution.edges)
+    large_m, as_well = 0.015, 1.5  # range offset that is suspicious, and mean square residual over that of the other
+    offset = abs(own.range_offset_m)
+    if offset < large_m:
+        return []
+    for change, right in _other_quantities(stated):
+        other = _tried(stated.changed(change), solution.edges)
+        left = abs(other.range_offset_m)
+        if other.mean_square < as_well * own.mean_square and left < offset / 2:
+            return [
+                f"{_AS}{right} the numbers fit as well, with a range offset of {1e3 * left:.0f} mm in place of"
+                f" {1e3 * offset:.0f} mm"
+            ]
+    return []
+
+
+def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
+    """Return the likely cause of doubts: the change of a stated value that fits best, if it fits much better."""
+    stated = _asked(solution.problem)
+    cause = _better(stated, solution.edges)
+    if cause:
+        return cause
+    for doubt in doubts:
+        if doubt.startswith(_AS):
+            right = doubt.removeprefix(_AS).split()[0]
+            return _QUANTITY.format(right=right)
+        if doubt.startswith(f"the {PARAMETERS['delay'].title} ran to"):
+            delay_s = float(solution.theta[ALL_NAMES.index("delay")])
+            return _CLOCKS.format(delay_ms=1e3 * delay_s)
+    if len(doubts) == 1 and "delay cannot be determined" in doubts[0]:
+        return (
+            "the camera hardly moves: turn and approach faster, or state the delay with Mounting(delay_s=…) and give"
+            " fixed=delay"
+        )
+    return (
+        "no change of delay, quantity or order explains it: are the landmark and its size right, do the poses refer to"
+        " the lens and the landmark's axis, and are all of one recording?"
     )
+
+
+def cause_of_refusal(problem: Problem) -> str:
+    """Return the likely cause of frames that do not fit at all, or nothing: as a part of a sentence."""
+    cause = _better(_asked(problem), None)
+    return f"; likely cause: {cause}" if cause else ""
+
+
+def _better(stated: Problem, edges: bool | None) -> str:
+    """Return the sentence of the change that fits best and much better than what was stated; nothing if none does."""
+    own = _tried(stated, edges)
+    tried = [(_tried(changed, edges), sentence) for changed, sentence in _alternatives(stated)]
+    enough = 0.6 * max([own.pixels, *(found.pixels for found, _ in tried)])  # what few pixels fit is no better
+    own_square = own.mean_square if own.pixels >= enough else math.inf
+    good = [(found.mean_square, found, text) for found, text in tried if found.pixels >= enough]
+    least = min([square for square, _, _ in good], default=math.inf)
+    if stated.moving:
+        alone, part = min((_tried(stated.changed(partial(_half, part=part)), edges), part) for part in _HALVES)
+        much_better = 0.25  # mean square residual over that of the whole, and over that of any change of the whole
+        if alone.pixels > own.pixels / 4 and alone.mean_square < min(
+            much_better * min(own.mean_square, least), _FITS_M**2
+        ):
+            return f"the frames of the {part} half fit their poses, the others do not: are all poses of this recording?"
+    if least > min(_BETTER * own_square, _FITS_M**2):
+        return ""
+    alike = [text.format(delay_ms=1e3 * found.delay_s) for square, found, text in good if square <= _AS_GOOD * least]
+    return "; or ".join(dict.fromkeys(alike))
+
+
+def _half(problem: Problem, part: str) -> Problem:
+    which = np.array_split(np.arange(len(problem.frames)), 2)[_HALVES.index(part)]
+    return replace(problem, frames=problem.frames[which])
+
+
+def _asked(problem: Problem) -> Problem:
+    """Return a problem as it was asked, of a moving camera with the poses as read, and the albedo not free."""
+    names = tuple(name for name in problem.names if name != "albedo")
+    return problem.changed(lambda one: replace(one.asked or one, names=names))
+
+
+def _with_delay(problem: Problem) -> Problem:
+    return replace(problem, names=(*problem.names, "delay"))
+
+
+def _late(problem: Problem, delay_s: float) -> Problem:
+    return replace(problem, assumed=replace(problem.assumed, delay_s=problem.assumed.delay_s + delay_s))
+
+
+def _other_quantity(problem: Problem, reports_z: bool) -> Problem:
+    """Return a problem whose numbers were z and were read as ranges, or the other way round."""
+    frames, cosine = problem.frames, problem.sensor.axis_cosine()
+    quantity = frames.range_m / cosine if reports_z else frames.range_m * cosine
+    return replace(problem, frames=replace(frames, range_m=quantity), reports_z=reports_z)
+
+
+def _other_quantities(problem: Problem) -> list[tuple[_Change, str]]:
+    """Return how the numbers may have been taken wrongly, each with what they are then.
+
+    A camera that reports z may have them read as ranges, too.
+    """
+    both: list[tuple[_Change, str]] = [
+        (partial(_other_quantity, reports_z=True), "z"),
+        (partial(_other_quantity, reports_z=False), "range"),
+    ]
+    return both if problem.reports_z else both[:1]
+
+
+def _flipped(problem: Problem) -> Problem:
+    frames = problem.frames
+    flipped = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
+    return replace(problem, frames=replace(frames, **flipped))
+
+
+def _in_order(problem: Problem, order: NDArray[np.integer]) -> Problem:
+    return replace(problem, poses=problem.poses[order])
+
+
+def _posed(problem: Problem, x: float = 1.0, y: float = 1.0, heading: float = 1.0) -> Problem:
+    """Return a problem with coordinates and headings of its poses multiplied, in the landmark's frame."""
+    poses = problem.poses
+    turned = np.angle(np.exp(1j * (poses.delta_rad - poses.bearing_rad)))
+    azimuth = np.arctan2(y * np.sin(poses.delta_rad), x * np.cos(poses.delta_rad))
+    bearing = np.angle(np.exp(1j * (azimuth - heading * turned)))
+    return replace(problem, poses=replace(poses, delta_rad=azimuth, bearing_rad=bearing))
 
 
 def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
     """Return problems that differ from the stated one in one value, each with what would then be right."""
-    frames, poses, track, names = stated.frames, stated.poses, stated.track, stated.names
-    cosine, (right, wrong) = stated.sensor.axis_cosine(), ("range", "z") if stated.reports_z else ("z", "range")
-    quantity = replace(frames, range_m=frames.range_m * cosine if stated.reports_z else frames.range_m / cosine)
-    turned = replace(poses, delta_rad=-poses.delta_rad, bearing_rad=-poses.bearing_rad)
-    flipped = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
-    changed = [
-        (
-            replace(stated, frames=quantity, reports_z=not stated.reports_z),
-            f"the numbers are likely {right}, not {wrong}: give quantity={right}",
-        ),
-        (
-            replace(stated, poses=turned, track=None if track is None else track.mirrored()),
-            "angles of the poses likely have the other sign: counter-clockwise",
-        ),
-        (replace(stated, frames=replace(frames, **flipped)), "images are likely mirrored: give flip_h=True"),
+    changes: list[tuple[_Change, str]] = [
+        *((change, _QUANTITY.format(right=right)) for change, right in _other_quantities(stated)),
+        (partial(_posed, y=-1, heading=-1), "angles of the poses likely have the other sign: counter-clockwise"),
+        (partial(_posed, heading=-1), "headings of the poses likely have the other sign: counter-clockwise"),
+        (partial(_posed, y=-1), "y of the poses, or δ, likely has the other sign"),
+        (partial(_posed, x=-1), "x of the poses likely has the other sign: x_m is that of the lens"),
+        (partial(_posed, x=-1, y=-1), "x and y of the poses likely have the other sign: they are those of the lens"),
+        (partial(_posed, heading=math.degrees(1)), "headings of the poses are likely radians: heading_deg is degrees"),
+        (_flipped, "images are likely mirrored: give flip_h=True"),
     ]
-    if track is None:
-        order = np.arange(len(poses))
-        changed += [
-            (replace(stated, poses=poses[which]), sentence)
+    if not stated.moving:
+        order = np.arange(len(stated.poses))
+        changes += [
+            (partial(_in_order, order=which), sentence)
             for which, sentence in (
                 (order[::-1], "the poses are likely in the reverse order of the frames"),
                 (np.roll(order, 1), "each frame likely belongs to the pose before: check the order"),
                 (np.roll(order, -1), "each frame likely belongs to the next pose: check the order"),
             )
         ]
-    elif "delay" not in names:
-        late = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: leave the delay free"
-        changed.append((replace(stated, names=(*names, "delay")), late))
-    return changed
+    else:
+        if "delay" not in stated.names:
+            late = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: leave the delay free"
+            changes.append((_with_delay, late))
+        changes += [(partial(_late, delay_s=delay_s), _CLOCKS) for delay_s in (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)]
+    return [(stated.changed(change), sentence) for change, sentence in changes]
 
 
-def _misfit(problem: Problem, edges: bool) -> tuple[float, float]:
-    """Return the mean square residual (m²) and the delay (s) of the best mounting no farther than what can be."""
-    fit = RecordingFit(problem, edges=edges)
-    theta = fit.approach()
+class _Tried(NamedTuple):
+    mean_square: float
+    pixels: int
+    delay_s: float
+    range_offset_m: float
+
+
+def _tried(problem: Problem, edges: bool | None) -> _Tried:
+    """Return how the best mounting no farther than what can be fits, on fewer frames than a calibration takes."""
+    try:
+        if problem.moving:
+            problem = problem.changed(lambda one: one.by_time(_FRAMES_TRIED // len(problem.recordings))[0])
+        fit = RecordingFit(problem, edges=edges)
+        found = fit.approach()
+    except UsageError:
+        return _Tried(math.inf, 0, math.nan, math.nan)
     assumed, most = fit.assumed[fit.columns], TRUSTED * fit.prior * fit.scale
-    held = theta.copy()
-    held[fit.columns] = np.clip(theta[fit.columns], assumed - most, assumed + most)
-    return fit.misfit(held), float(theta[ALL_NAMES.index("delay")])
+    held = found.theta.copy()
+    held[fit.columns] = np.clip(held[fit.columns], assumed - most, assumed + most)
+    square, count = fit.misfit(found._replace(theta=held))
+    return _Tried(square, count, fit.delay_s(found), float(held[ALL_NAMES.index("range_offset")]))

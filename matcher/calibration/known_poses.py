@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -84,6 +85,18 @@ class KnownPoses:
         arrays = {name: values for name, values in vars(self).items() if name != "place"}
         taken: dict[str, Any] = {name: None if a is None else a[which] for name, a in arrays.items()}
         return KnownPoses(**taken, place=place)
+
+    @classmethod
+    def joined(cls, parts: Sequence[KnownPoses]) -> KnownPoses:
+        """Return the poses of several recordings; what one of them lacks all lack."""
+        joined: dict[str, Any] = {}
+        for name in vars(parts[0]):
+            values = [getattr(part, name) for part in parts]
+            if name == "place":
+                joined[name] = sum(values, ()) if all(values) else ()
+            else:
+                joined[name] = None if any(one is None for one in values) else np.concatenate(values)
+        return cls(**joined)
 
     def where(self, k: int) -> str:
         """Name one pose in a message."""

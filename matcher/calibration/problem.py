@@ -24,8 +24,8 @@ from phasemark.render import Background, Sensor
 
 FEWEST_POSES = 3
 """Minimum number of poses. Fewer suffice if fewer parameters are free."""
-_MOST_FRAMES = 800
-"""Frames of a recording that enter; more are thinned evenly."""
+MOST_FRAMES = 800
+"""Frames that enter, of all recordings; more are thinned evenly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +53,12 @@ class Problem:
         How a camera of several modulation frequencies became that of the frames.
     track : PoseTrack, optional
         Of a moving camera.
+    others : tuple of Problem
+        Further recordings of the camera, which share the mounting but for small differences.
+    moving : bool
+        Whether poses go with frames by time.
+    asked : Problem, optional
+        Of a problem with `track`, the one with all frames and the poses as read.
     """
 
     mesh: trimesh.Trimesh
@@ -68,6 +74,24 @@ class Problem:
     rendered: Callable[[], None]
     one: OneFrequency | None
     track: PoseTrack | None = None
+    others: tuple[Problem, ...] = ()
+    moving: bool = False
+    asked: Problem | None = None
+
+    @property
+    def recordings(self) -> tuple[Problem, ...]:
+        """All recordings, this one first."""
+        return (replace(self, others=()), *self.others)
+
+    @property
+    def common(self) -> tuple[str, ...]:
+        """Names of free parameters common to all recordings: a delay is a fact of the two clocks of each."""
+        return tuple(name for name in self.names if name != "delay" or not self.others)
+
+    def changed(self, change: Callable[[Problem], Problem]) -> Problem:
+        """Return the problem with a change of every recording."""
+        first, *others = map(change, self.recordings)
+        return replace(first, others=tuple(others))
 
     @property
     def sensor(self) -> Sensor:
@@ -91,7 +115,7 @@ class Problem:
         )
 
     def poses_with(self, delay_s: float) -> KnownPoses:
-        """Return the poses of the frames; those of a moving camera at their stamps plus a delay."""
+        """Return the poses of the frames of this recording; those of a moving camera at their stamps plus a delay."""
         if self.track is None or self.frames.time_s is None:
             return self.poses
         times = self.frames.time_s + delay_s
@@ -99,7 +123,7 @@ class Problem:
         place = tuple(f"pose at {time:.3f} s" for time in times)
         return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
 
-    def by_time(self) -> tuple[Problem, list[str]]:
+    def by_time(self, most_frames: int = MOST_FRAMES) -> tuple[Problem, list[str]]:
         """Return the problem with poses by time and the frames that have one, and notes on what was left out."""
         frames = self.frames
         if self.poses.wall_m is not None:
@@ -133,11 +157,11 @@ class Problem:
             gap: (~known & ~unclear).sum(),
         }
         notes = [f"{n} {words}." for words, n in counted.items() if n]
-        if len(index) > _MOST_FRAMES:
-            notes.append(f"Of {len(index)} frames {_MOST_FRAMES} entered, evenly spaced.")
-            index = index[np.linspace(0, len(index) - 1, _MOST_FRAMES).round().astype(int)]
+        if len(index) > most_frames:
+            notes.append(f"Of {len(index)} frames {most_frames} entered, evenly spaced.")
+            index = index[np.linspace(0, len(index) - 1, most_frames).round().astype(int)]
         track = replace(track, jitter_s=max(track.jitter_s, stamp_jitter(frames.time_s)))
-        timed = replace(self, frames=replace(frames, time_s=stamps)[index], track=track)
+        timed = replace(self, frames=replace(frames, time_s=stamps)[index], track=track, asked=self)
         return replace(timed, poses=timed.poses_with(delay)), notes
 
 
@@ -163,6 +187,7 @@ class Fitted:
     notes: tuple[str, ...]
     held_out_m: tuple[float, float] = (math.nan, math.nan)
     left_out: float = 0.0
+    own: tuple[Mapping[str, tuple[float, float]], ...] = ()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -179,6 +204,8 @@ class Solution(Fitted):
         Which pixels count.
     edges : bool
         Whether pixels that see the landmark in part may count.
+    frames_left_out : float
+        Share of the frames of which more than half of the pixels that see the landmark have no weight.
     sensor_fields : mapping of str to value
         Fields of the sensor that were estimated beside the mounting.
     """
@@ -187,6 +214,7 @@ class Solution(Fitted):
     theta: NDArray[np.float64]
     use: NDArray[np.bool_]
     edges: bool
+    frames_left_out: float = 0.0
     sensor_fields: Mapping[str, object] = field(default_factory=dict)
 
 

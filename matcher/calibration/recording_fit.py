@@ -2,13 +2,15 @@
 
 The ranges y of frame k are modelled as
 
-    y = f(pose at stamp + delay, mounting) + zone offsets + S (e_k + e_b) + n
+    y = f(pose at stamp + delay, mounting + u_r) + zone offsets + S (e_k + e_b) + n
 
-with the slopes S of the ranges by distance, δ, bearing, height and time, an error e_k of the pose of each frame, an
-error e_b common to each block of time, and the noise n of pixels. Mounting and zone offsets are found by Gauss–Newton
+with what its recording has of its own u_r (:mod:`phasemark.matcher.calibration.recording_effects`), the slopes S of the
+ranges by distance, δ, bearing, height and time, an error e_k of the pose of each frame, an error e_b common to each
+block of time, and the noise n of pixels. Mounting, u_r and zone offsets are found by Gauss–Newton
 under the covariance of the rest, with weak priors on the mounting. The sizes of e_k, e_b and of the zone offsets are
 those of the greatest restricted likelihood (:mod:`phasemark.matcher.estimate.variances`); the noise law is fitted to
-the squares of the residuals. So errors that vary slowly widen the covariance instead of being divided by √N.
+the squares of the residuals. So errors that vary slowly widen the covariance instead of being divided by √N. Where
+results without one block of time each scatter more than that says, the covariance is widened by as much.
 
 Only pixels that the model says see nothing but the landmark have weight, and of these only those whose residual is
 within a few standard deviations: a floor, a wall or an edge does not enter.
@@ -18,19 +20,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
-from phasemark import UsageError
 from phasemark.matcher.calibration import notes as sentences
 from phasemark.matcher.calibration.checks import check_poses, check_ranges, check_view, returns_beside
-from phasemark.matcher.calibration.mounting import columns_of, prior_std
-from phasemark.matcher.calibration.mounting_model import EFFECTS, Images, range_residual
-from phasemark.matcher.calibration.problem import Problem, Solution, in_image, rms
+from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, columns_of, prior_std
+from phasemark.matcher.calibration.mounting_model import EFFECTS, CalibrationModel, Images, range_residual
+from phasemark.matcher.calibration.problem import MOST_FRAMES, Problem, Solution, in_image, rms
+from phasemark.matcher.calibration.recording_effects import TURN, RecordingSizes, own_names
 from phasemark.matcher.estimate.variances import RandomEffects
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS
 from phasemark.render.sensor.range_noise import direct_range_std
 from phasemark.render.sensor.sensor_file import rounded
 
@@ -46,42 +50,81 @@ _UNIT = np.array([1e-3, math.radians(0.1), math.radians(0.1), 1e-3, 5e-3])
 """Units of the errors of poses: 1 mm, 0.1°, 0.1°, 1 mm, and 5 ms of time."""
 _SIZE_BOUNDS, _ZONE_BOUNDS = (0.02, 100.0), (0.02, 50.0)
 """Of the sizes of errors of poses and of zone offsets, in their units."""
-_APPROACH, _ROUNDS, _STEPS = 8, 3, 3
+_APPROACH, _FEWEST_ROUNDS, _MOST_ROUNDS, _STEPS = 8, 3, 8, 3
 _FIRST_GATE_M = 0.25
 _GATE = 4.0
 """Standard deviations beyond which a pixel has no weight."""
 _SETTLED = 0.01
 """A step below this many standard deviations ends the iteration."""
+_SAME = 0.1
+"""A round that moves the mounting by less than this many standard deviations is the last."""
 _LEAST_NOISE_M = 1e-4
 FOLDS = 4
 """Parts into which blocks of time are dealt to be held out."""
 
 
-def solve_recording(problem: Problem, *, moving: bool) -> Solution:
+def solve_recording(problem: Problem) -> Solution:
     """Find mounting, delay, zone offsets and noise from many poses, by time or one for each frame."""
     notes: list[str] = []
-    if moving:
-        problem, notes = problem.by_time()
+    if problem.moving:
+        problem, notes = _by_time(problem)
     else:
         check_poses(problem)
     fit = RecordingFit(problem)
-    if not moving:
-        check_view(fit.model, fit.evidence, problem.assumed)
-    images = fit.model.images(fit.assumed)
-    check_ranges(fit.model, fit.evidence, np.where(fit.candidates(images), fit.residual(images), np.nan))
+    for recorded in fit.recorded:
+        if not problem.moving:
+            check_view(recorded.model, recorded.evidence, problem.assumed)
+        images = recorded.model.images(fit.assumed)
+        where = recorded.candidates(images, edges=fit.edges)
+        check_ranges(recorded.model, recorded.evidence, np.where(where, recorded.residual(images), np.nan))
     solution = fit.solve(fit.approach())
     std = np.sqrt(np.diag(solution.covariance))
-    delay_std = std[problem.names.index("delay")] if "delay" in problem.names else 0.0
-    delay_unknown_s = 0.05
-    if delay_std > delay_unknown_s:
-        raise UsageError(
-            f"the delay cannot be determined from this recording (± {1e3 * delay_std:.0f} ms): turn and approach"
-            " faster, or state it with Mounting(delay_s=…) and give fixed=delay"
-        )
     prior = fit.prior * fit.scale
     from_prior = 0.7  # standard deviation over that of the prior, from which the data are said not to tell a number
-    untold = [name for name, of_prior in zip(problem.names, std > from_prior * prior, strict=True) if of_prior]
+    untold = [name for name, of_prior in zip(problem.common, std > from_prior * prior, strict=True) if of_prior]
     return replace(solution, notes=(*notes, *sentences.untold_notes(untold), *solution.notes))
+
+
+def _by_time(problem: Problem) -> tuple[Problem, list[str]]:
+    """Return the problem with poses by time, and notes on what was left out, of several recordings by their number."""
+    recordings = problem.recordings
+    found = [one.by_time(MOST_FRAMES // len(recordings)) for one in recordings]
+    several = len(found) > 1
+    notes = [f"Recording {k}: {note}" if several else note for k, (_, own) in enumerate(found, 1) for note in own]
+    return replace(found[0][0], others=tuple(one for one, _ in found[1:])), notes
+
+
+class Place(NamedTuple):
+    """Mounting, zone offsets and what each recording has of its own, in a descent."""
+
+    theta: _Float
+    """(21,): mounting."""
+    zone: _Float
+    """(pixels,): zone offsets, metres."""
+    own: _Float
+    """(R, q): what each recording has of its own; metres, radians, seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Frames of one recording with their model."""
+
+    model: CalibrationModel
+    evidence: Evidence
+
+    @classmethod
+    def of(cls, problem: Problem) -> Recorded:
+        """Take the frames of one recording, on ranges."""
+        return cls(problem.model(), Evidence.from_frames(problem.frames, "ranges"))
+
+    def residual(self, images: Images) -> _Float:
+        """Return measured less modelled ranges without zone offsets, (K, pixels); NaN where there is none."""
+        return np.where(self.evidence.weight > 0, range_residual(self.evidence, images), np.nan)
+
+    def candidates(self, images: Images, *, edges: bool) -> _Bool:
+        """Return which pixels returned and see the landmark, alone and a pixel from its edge unless edges count."""
+        there = (images.phasor != 0) & (self.evidence.weight > 0)
+        return np.asarray(there if edges else there & self.model.alone(images, from_edges=True))
 
 
 @dataclass(frozen=True)
@@ -93,12 +136,15 @@ class Sizes:
     frame, block : (5,) float64
         Of pose errors of frames and of blocks of time: distance, δ, bearing, height, and time (jitter of the stamps);
         in their units.
+    recording : RecordingSizes
+        Of what recordings have of their own.
     zone : float
-        Of the zone offsets, in theirs.
+        Of the zone offsets, in their unit.
     """
 
     frame: _Float
     block: _Float
+    recording: RecordingSizes
     zone: float = 2.0
 
     @property
@@ -119,47 +165,91 @@ class RecordingFit:
     """
 
     def __init__(self, problem: Problem, *, edges: bool | None = None) -> None:
-        self.problem, self.free, self.zones = problem, problem.names, problem.zones
+        self.problem, self.free, self.zones = problem, problem.common, problem.zones
         self.assumed, self.sensor = problem.assumed.vector, problem.sensor
-        self.model, self.evidence = problem.model(), Evidence.from_frames(problem.frames, "ranges")
+        self.recorded = [Recorded.of(one) for one in problem.recordings]
+        self.seen_range_m = np.concatenate([one.evidence.seen.range_m for one in self.recorded])
+        self.stated_weight = np.concatenate([one.evidence.weight for one in self.recorded])
         direct = self.sensor.kind == "direct"
         if edges is None:
-            edges = self.model.has_background or not (direct or returns_beside(self.model, self.evidence))
+            edges = all(
+                one.model.has_background or not (direct or returns_beside(one.model, one.evidence))
+                for one in self.recorded
+            )
         self.edges = edges
         self.columns = columns_of(self.free)
-        self.scale = self.model.scale[self.columns]
-        self.prior = np.array([prior_std(name, self.assumed, self.model.scale) for name in self.free]) / self.scale
+        self.scale = self.recorded[0].model.scale[self.columns]
+        natural = self.recorded[0].model.scale
+        self.prior = np.array([prior_std(name, self.assumed, natural) for name in self.free]) / self.scale
         self.stated_zones = self.sensor.zone_offsets.ravel()
-        n, stamps, track = len(problem.frames), problem.frames.time_s, problem.track
-        block, self.least = np.arange(n), np.zeros(len(EFFECTS))
-        if track is not None and stamps is not None:
-            length = min(_BLOCK_S, max(float(stamps[-1] - stamps[0]) / _BLOCKS, _SHORTEST_BLOCK_S))
-            block = np.floor((stamps - stamps[0]) / length).astype(np.int64)
-            self.least[-1] = track.jitter_s / _UNIT[-1]  # stamps are at least so uncertain
+        self.own = own_names(problem.names, len(self.recorded), moving=problem.track is not None)
+        self.least = np.zeros(len(EFFECTS))
+        self._set_blocks()
+
+    def _set_blocks(self) -> None:
+        """Set to which recording each frame belongs, the first frame of each block of time, and what stamps leave."""
+        blocks: list[NDArray[np.int64]] = []
+        for one in self.problem.recordings:
+            block, stamps = np.arange(len(one.frames)), one.frames.time_s
+            if one.track is not None and stamps is not None:
+                length = min(_BLOCK_S, max(float(stamps[-1] - stamps[0]) / _BLOCKS, _SHORTEST_BLOCK_S))
+                block = np.floor((stamps - stamps[0]) / length).astype(np.int64)
+                self.least[-1] = max(self.least[-1], one.track.jitter_s / _UNIT[-1])  # stamps are so uncertain at least
+            blocks.append(block + (blocks[-1][-1] + 1 if blocks else 0))
+        block = np.concatenate(blocks)
+        self.recording = np.repeat(np.arange(len(blocks)), [len(one) for one in blocks])
         self.start = np.flatnonzero(np.diff(block, prepend=-1) != 0)
-        self.single = len(self.start) == n
+        self.single = len(self.start) == len(block)
+
+    @property
+    def start_place(self) -> Place:
+        """What is assumed."""
+        return Place(self.assumed, self.stated_zones, np.zeros((len(self.recorded), len(self.own))))
 
     # the model
 
-    def residual(self, images: Images) -> _Float:
-        """Return measured less modelled ranges without zone offsets, (K, pixels); NaN where there is none."""
-        return np.where(self.evidence.weight > 0, range_residual(self.evidence, images), np.nan)
+    def of_recording(self, place: Place, r: int) -> tuple[_Float, _Float | None]:
+        """Return the mounting of a recording, and what is added to its poses."""
+        own = dict(zip(self.own, place.own[r].tolist(), strict=True))
+        turn = own.pop(TURN, 0.0)
+        model = self.recorded[r].model
+        theta = model.stepped(place.theta, columns_of(list(own)), np.array(list(own.values()))) if own else place.theta
+        return theta, np.tile([0.0, -turn, -turn, 0.0], (len(model.poses), 1)) if turn else None
 
-    def candidates(self, images: Images) -> _Bool:
-        """Return which pixels returned and see the landmark, alone and a pixel from its edge unless edges count."""
-        there = (images.phasor != 0) & (self.evidence.weight > 0)
-        return np.asarray(there if self.edges else there & self.model.alone(images, from_edges=True))
+    def seen(self, place: Place) -> tuple[_Float, _Bool]:
+        """Return the residuals at a place, (K, pixels), and which pixels may count."""
+        residuals, candidates = [], []
+        for r, one in enumerate(self.recorded):
+            images = one.model.images(*self.of_recording(place, r))
+            residuals.append(one.residual(images))
+            candidates.append(one.candidates(images, edges=self.edges))
+        return np.concatenate(residuals) - place.zone, np.concatenate(candidates)
 
-    def seen(self, theta: _Float, zone: _Float) -> tuple[_Float, _Bool]:
-        """Return the residuals at a place, and which pixels may count."""
-        images = self.model.images(theta)
-        return self.residual(images) - zone, self.candidates(images)
+    def slopes(self, place: Place) -> tuple[_Float, _Float]:
+        """Return slopes of the ranges by parameters, (K, p + R q, pixels), and by pose errors, (K, 5, pixels).
 
-    def slopes(self, theta: _Float) -> tuple[_Float, _Float]:
-        """Return slopes of the ranges by the free parameters, (K, p, pixels), and by pose errors, (K, 5, pixels)."""
-        slope = self.model.slopes(theta, (*self.free, *EFFECTS), "ranges")
-        by_free, by_pose = np.split(self.sensor.metres_per_radian * slope.imag, [len(self.free)], axis=1)
-        return by_free, by_pose
+        The parameters are the free ones, in natural units, and what each recording has of its own.
+        """
+        found = []
+        for r, one in enumerate(self.recorded):
+            theta, shift = self.of_recording(place, r)
+            slope = one.model.slopes(theta, (*self.free, *EFFECTS), "ranges", shift=shift)
+            found.append(self.sensor.metres_per_radian * slope.imag)
+        by_free, by_pose = np.split(np.concatenate(found), [len(self.free)], axis=1)
+        by_turn = -by_pose[:, EFFECTS.index("delta_rad")] - by_pose[:, EFFECTS.index("bearing_rad")]
+        by_name = {TURN: by_turn, "delay": by_pose[:, EFFECTS.index("time_s")]}
+        by_own = [by_name[name] if name in by_name else by_free[:, self.free.index(name)] for name in self.own]
+        parts = [
+            np.where((self.recording == r)[:, None], one, 0.0)[:, None]
+            for r in range(len(self.recorded))
+            for one in by_own
+        ]
+        return np.concatenate([by_free * self.scale[:, None], *parts], axis=1), by_pose
+
+    def delay_s(self, place: Place) -> float:
+        """Return the delay, of several recordings the mean."""
+        own = float(place.own[:, self.own.index("delay")].mean()) if "delay" in self.own else 0.0
+        return float(place.theta[ALL_NAMES.index("delay")]) + own
 
     # linear algebra
 
@@ -167,7 +257,7 @@ class RecordingFit:
         """Return Gram matrices of the parameters (in natural units) and the pose errors (in their units)."""
         weight = np.where(use, 1 / std**2, 0.0)
         r = np.where(use, residual, 0.0)
-        j = np.where(use[:, None], slopes[0], 0.0) * self.scale[:, None]
+        j = np.where(use[:, None], slopes[0], 0.0)
         s = np.where(use[:, None], slopes[1], 0.0) * _UNIT[:, None]
         wj, ws = weight[:, None] * j, weight[:, None] * s
         js, jr = j @ ws.transpose(0, 2, 1), np.einsum("kpr,kr->kp", wj, r)
@@ -189,36 +279,39 @@ class RecordingFit:
             self.start,
         )
 
-    def prior_of(self, theta: _Float, zone: _Float, sizes: Sizes) -> tuple[_Float, _Float]:
+    def prior_of(self, place: Place, sizes: Sizes) -> tuple[_Float, _Float]:
         """Return the prior's precision and how far its mean is from a place, (P,) each, in natural units."""
-        precision, away = self.prior**-2.0, (self.assumed - theta)[self.columns] / self.scale
-        if not self.zones:
-            return precision, away
-        of_zones = np.full(zone.shape, sizes.zone**-2.0)
-        return np.append(precision, of_zones), np.append(away, (self.stated_zones - zone) / _ZONE_UNIT_M)
+        precision = [self.prior**-2.0, np.tile(sizes.recording.std**-2.0, len(self.recorded))]
+        away = [(self.assumed - place.theta)[self.columns] / self.scale, -place.own.ravel()]
+        if self.zones:
+            precision.append(np.full(place.zone.shape, sizes.zone**-2.0))
+            away.append((self.stated_zones - place.zone) / _ZONE_UNIT_M)
+        return np.concatenate(precision), np.concatenate(away)
 
     def step(
-        self, linear: RandomEffects, theta: _Float, zone: _Float, sizes: Sizes, keep: _Bool | None = None
+        self, linear: RandomEffects, place: Place, sizes: Sizes, keep: _Bool | None = None
     ) -> tuple[_Float, _Float]:
         """Return the Gauss–Newton step and the covariance, in natural units."""
         information, gradient, _, _ = linear.marginal(sizes.frame, sizes.block, keep)
-        precision, away = self.prior_of(theta, zone, sizes)
+        precision, away = self.prior_of(place, sizes)
         covariance = np.asarray(np.linalg.inv(information + np.diag(precision)))
         return covariance @ (gradient + precision * away), covariance
 
-    def moved(self, theta: _Float, zone: _Float, step: _Float) -> tuple[_Float, _Float]:
+    def moved(self, place: Place, step: _Float) -> Place:
         """Return the place a step leads to."""
-        own, of_zones = np.split(step, [len(self.free)])
-        there = self.model.stepped(theta, self.columns, self.scale * own)
-        return there, zone + _ZONE_UNIT_M * of_zones if self.zones else zone
+        common, own, of_zones = np.split(step, np.cumsum([len(self.free), place.own.size]))
+        theta = self.recorded[0].model.stepped(place.theta, self.columns, self.scale * common)
+        zone = place.zone + _ZONE_UNIT_M * of_zones if self.zones else place.zone
+        return Place(theta, zone, place.own + own.reshape(place.own.shape))
 
     def settled(self, step: _Float, covariance: _Float, share: float) -> bool:
         """Return True if the mounting moves by less than a share of its standard deviations."""
-        return bool((np.abs(step) < share * np.sqrt(np.diag(covariance)))[: len(self.free)].all())
+        p = len(self.free)
+        return bool((np.abs(step[:p]) < share * np.sqrt(np.diag(covariance)[:p])).all())
 
     # sizes of errors
 
-    def sizes(self, linear: RandomEffects, theta: _Float, zone: _Float, start: Sizes) -> Sizes:
+    def sizes(self, linear: RandomEffects, place: Place, start: Sizes) -> Sizes:
         """Return the most likely sizes; one that gains too little likelihood is zero."""
         effects = len(EFFECTS)
         own = effects if self.single else 2 * effects
@@ -226,11 +319,12 @@ class RecordingFit:
         def unpacked(log: _Float, active: _Bool) -> Sizes:
             values = np.where(active, np.exp(log), 0.0)
             block = np.zeros(effects) if self.single else values[effects:own]
-            return Sizes(np.maximum(values[:effects], self.least), block, values[own] if self.zones else start.zone)
+            zone = values[own] if self.zones else start.zone
+            return Sizes(np.maximum(values[:effects], self.least), block, start.recording, zone)
 
         def cost(log: _Float, active: _Bool) -> float:
             sizes = unpacked(log, active)
-            return linear.minus_two_log(sizes.frame, sizes.block, self.prior_of(theta, zone, sizes))
+            return linear.minus_two_log(sizes.frame, sizes.block, self.prior_of(place, sizes))
 
         def fitted(log: _Float, active: _Bool) -> tuple[_Float, float]:
             if not active.any():
@@ -270,7 +364,17 @@ class RecordingFit:
             active[i], best, dropped = False, lowest, True
         if dropped:
             log, _ = fitted(log, active)
-        return unpacked(log, active)
+        found = unpacked(log, active)
+        if len(self.recorded) == 1:
+            return found
+        information, gradient, _, _ = linear.marginal(found.frame, found.block)
+        precision, away = self.prior_of(place, found)
+        first = len(self.free)
+        others = np.ones(len(precision), bool)
+        others[first : first + place.own.size] = False
+        gradient = gradient + np.where(others, precision * away, 0.0)
+        likely = found.recording.most_likely(information, gradient, precision, place.own, first)
+        return replace(found, recording=likely)
 
     def noise(self, residual: _Float, leverage: _Float, use: _Bool, old: _Noise) -> _Noise:
         """Return the noise law of a direct sensor: squares of residuals regressed on 1, 1/I and 1/I².
@@ -279,7 +383,7 @@ class RecordingFit:
         beside the ambient one, whose shape over a short span of ranges is nearly the same.
         """
         square = residual[use] ** 2 / np.maximum(1 - leverage[use], 0.1)
-        over_i = self.evidence.seen.range_m[use] ** 2 / 0.8
+        over_i = self.seen_range_m[use] ** 2 / 0.8
         best = (math.inf, old)
         term_shows = 6.63  # −2 log likelihood that a term of the noise law must gain (1 %)
         for terms in ((0,), (0, 2), (0, 1), (0, 1, 2)):
@@ -299,90 +403,105 @@ class RecordingFit:
         """Return the noise of each pixel by a noise law, (K, pixels)."""
         constant, shot, ambient = noise
         sensor = self.sensor.with_(range_std_m=constant, range_shot_std_m=shot, range_ambient_std_m=ambient)
-        law = direct_range_std(0.8 / np.maximum(self.evidence.seen.range_m, 1e-3) ** 2, sensor)
+        law = direct_range_std(0.8 / np.maximum(self.seen_range_m, 1e-3) ** 2, sensor)
         return np.asarray(np.maximum(law, _LEAST_NOISE_M))
 
     # the whole
 
-    def approach(self) -> _Float:
+    def approach(self) -> Place:
         """Run Gauss–Newton from what is assumed, with a gate that narrows with the residuals; return the place."""
-        theta, zone, sizes = self.assumed, self.stated_zones, Sizes(np.full(len(_UNIT), 2.0), np.zeros(len(_UNIT)))
+        place, sizes = self.start_place, self.usual_sizes(2.0, 0.0)
         gate = _FIRST_GATE_M
         for _ in range(_APPROACH):
-            residual, seen = self.seen(theta, zone)
+            residual, seen = self.seen(place)
             near = seen & (np.abs(residual) < gate)
             if near.sum() < 3 * len(self.free):
                 break
             spread = _spread(residual[near])
             gate = max(min(gate, 4 * spread), 1e-3)
             use = seen & (np.abs(residual) < gate)
-            linear = self.linear(self.slopes(theta), residual, use, np.full(use.shape, max(spread, 1e-3)))
-            step, covariance = self.step(linear, theta, zone, sizes)
-            theta, _ = self.moved(theta, zone, step)
+            linear = self.linear(self.slopes(place), residual, use, np.full(use.shape, max(spread, 1e-3)))
+            step, covariance = self.step(linear, place, sizes)
+            place = self.moved(place, step)._replace(zone=self.stated_zones)
             if self.settled(step, covariance, 0.1) and gate > 3.9 * spread:
                 break
-        return theta
+        return place
 
-    def misfit(self, theta: _Float) -> float:
-        """Return the mean square of the residuals of all candidates, each at most 5 cm, m²."""
-        residual, seen = self.seen(theta, self.stated_zones)
-        return float((np.minimum(np.abs(residual[seen]), _FIRST_GATE_M / 5) ** 2).mean()) if seen.any() else math.inf
+    def usual_sizes(self, frame: float, block: float) -> Sizes:
+        """Return sizes of errors before a frame is seen; of poses some of their units."""
+        usual = RecordingSizes.usual(self.own, len(self.recorded))
+        return Sizes(np.full(len(EFFECTS), frame), np.full(len(EFFECTS), block), usual)
 
-    def solve(self, theta: _Float) -> Solution:
+    def misfit(self, place: Place) -> tuple[float, int]:
+        """Return the mean square of the residuals of all candidates, each at most 5 cm, m², and their number."""
+        residual, seen = self.seen(place._replace(zone=self.stated_zones))
+        if not seen.any():
+            return math.inf, 0
+        return float((np.minimum(np.abs(residual[seen]), _FIRST_GATE_M / 5) ** 2).mean()), int(seen.sum())
+
+    def solve(self, place: Place) -> Solution:
         """Find mounting, zone offsets, noise law and sizes of errors.
 
         Parameters
         ----------
-        theta : (21,) float64
-            A place from :meth:`approach`.
+        place : Place
+            From :meth:`approach`.
         """
-        zone, sensor = self.stated_zones, self.sensor
+        sensor = self.sensor
         fits_noise = self.zones and sensor.kind == "direct"
-        std = np.sqrt(1 / np.where(self.evidence.weight > 0, self.evidence.weight, 1.0))
-        twice = np.full(len(EFFECTS), 2.0)
-        sizes = Sizes(twice, np.zeros(len(EFFECTS)) if self.single else twice)
+        std = np.sqrt(1 / np.where(self.stated_weight > 0, self.stated_weight, 1.0))
+        sizes = self.usual_sizes(2.0, 0.0 if self.single else 2.0)
         noise = (sensor.range_std_m, sensor.range_shot_std_m, sensor.range_ambient_std_m)
         if fits_noise:
-            residual, seen = self.seen(theta, np.zeros_like(zone))
+            residual, seen = self.seen(place._replace(zone=np.zeros_like(place.zone)))
             spread = _spread(residual[seen & (np.abs(residual) < _FIRST_GATE_M)])
             std = np.full(std.shape, max(min(spread, 0.02), _LEAST_NOISE_M))
         pose_error = None
-        for _ in range(_ROUNDS):
-            slopes, first = self.slopes(theta), pose_error is None
+        for count in range(1, _MOST_ROUNDS + 1):
+            slopes, first, before = self.slopes(place), pose_error is None, place.theta
             for _ in range(_STEPS):
-                residual, seen = self.seen(theta, zone)
+                residual, seen = self.seen(place)
                 use = self._gated(residual, seen, slopes[1], std, sizes, None if first else pose_error)
                 linear = self.linear(slopes, residual, use, std)
-                step, covariance = self.step(linear, theta, zone, sizes)
+                step, covariance = self.step(linear, place, sizes)
                 pose_error = linear.errors(step, sizes.frame, sizes.block) * _UNIT
-                theta, zone = self.moved(theta, zone, step)
+                place = self.moved(place, step)
                 if self.settled(step, covariance, _SETTLED):
                     break
-            residual, seen = self.seen(theta, zone)
+            residual, seen = self.seen(place)
             use = self._gated(residual, seen, slopes[1], std, sizes, pose_error)
             linear = self.linear(slopes, residual, use, std)
             if fits_noise:
                 noise = self.noise(*self._left(linear, slopes[1], residual, use, std, sizes), use, noise)
                 std = self.std_of(noise)
                 linear = self.linear(slopes, residual, use, std)
-            sizes = self.sizes(linear, theta, zone, sizes)
-        step, covariance = self.step(linear, theta, zone, sizes)
-        theta, zone = self.moved(theta, zone, step)
+            sizes = self.sizes(linear, place, sizes)
+            moved = (place.theta - before)[self.columns] / self.scale
+            if count >= _FEWEST_ROUNDS and self.settled(moved, covariance, _SAME):
+                break
+        step, covariance = self.step(linear, place, sizes)
+        place = self.moved(place, step)
         pose_error = linear.errors(step, sizes.frame, sizes.block) * _UNIT
         chi2 = linear.marginal(sizes.frame, sizes.block).quadratic
-        after, seen = self.seen(theta, zone)
-        before = self.seen(self.assumed, self.stated_zones)[0]
+        after, seen = self.seen(place)
+        before = self.seen(self.start_place)[0]
         judged = use | (seen & (np.abs(before) < _GATE * _total(std, slopes[1], sizes)))
         judged &= np.isfinite(before) & np.isfinite(after)
-        held_out = self._held_out(self.linear(slopes, after, use, std), slopes[0], after, theta, zone, sizes)
-        beside = after - np.einsum("ks,ksr->kr", pose_error, self.slopes(theta)[1])
-        left_out = 1 - float(use.sum()) / max(int(seen.sum()), 1)
+        at_end = self.linear(slopes, after, use, std)
+        held_out = self._held_out(at_end, slopes[0], after, place, sizes)
+        wider = 1.0 if self.single else self._scatter_of_blocks(at_end, place, sizes, covariance)
+        beside = after - np.einsum("ks,ksr->kr", pose_error, self.slopes(place)[1])
+        left_out = 1 - float((use & seen).sum()) / max(int(seen.sum()), 1)
+        few = 3  # pixels of a frame that tell nothing of it
+        shown = seen.sum(axis=1)
+        frames_out = (use & seen).sum(axis=1)[shown > few] < shown[shown > few] / 2
         dof, systematic, p = int(use.sum()) - len(self.free), np.sqrt(sizes.variance), len(self.free)
         return Solution(
             problem=self.problem,
-            theta=theta,
-            covariance=covariance[:p, :p] * np.outer(self.scale, self.scale),
-            covariance_from="noise, slow errors and weak priors (restricted maximum likelihood)",
+            theta=place.theta,
+            covariance=wider * covariance[:p, :p] * np.outer(self.scale, self.scale),
+            covariance_from="noise, slow errors and weak priors (restricted maximum likelihood)"
+            + (f", {math.sqrt(wider):.2g} times as wide by the scatter of blocks of time" if wider > 1.0 else ""),
             chi2=chi2,
             dof=dof,
             p_value=float(special.chdtrc(max(dof, 1), chi2)),
@@ -396,8 +515,26 @@ class RecordingFit:
             edges=self.edges,
             notes=tuple(sentences.recording_notes(use, left_out, systematic)),
             left_out=left_out,
-            sensor_fields=self._sensor_fields(zone, noise, systematic) if self.zones else {},
+            frames_left_out=float(frames_out.mean()) if frames_out.size else 0.0,
+            own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),
+            sensor_fields=self._sensor_fields(place.zone, noise, systematic, sizes.recording),
         )
+
+    def _own_of_recordings(self, place: Place, std: _Float) -> tuple[dict[str, tuple[float, float]], ...]:
+        """Return the own numbers of each recording with their standard deviations."""
+        spread = std[len(self.free) :][: place.own.size].reshape(place.own.shape)
+        return tuple(
+            {name: (float(own[i]), float(of_own[i])) for i, name in enumerate(self.own)}
+            for own, of_own in zip(place.own, spread, strict=True)
+        )
+
+    def _scatter_of_blocks(self, linear: RandomEffects, place: Place, sizes: Sizes, covariance: _Float) -> float:
+        """Return by what factor results without one block of time each scatter beyond a covariance (jackknife)."""
+        count, p = len(self.start), len(self.free)
+        without = np.array([self.step(linear, place, sizes, np.arange(count) != k)[0][:p] for k in range(count)])
+        away = without - without.mean(axis=0)
+        scatter = (count - 1) / count * away.T @ away
+        return max(1.0, float(np.trace(np.linalg.solve(covariance[:p, :p], scatter))) / p)
 
     def _gated(
         self, residual: _Float, seen: _Bool, pose: _Float, std: _Float, sizes: Sizes, pose_error: _Float | None
@@ -421,34 +558,42 @@ class RecordingFit:
         left = residual - np.einsum("ks,ksr->kr", errors, pose)
         return left, np.minimum(leverage + count / max(int(use.sum()), 1), 0.9)
 
-    def _held_out(
-        self, linear: RandomEffects, slope: _Float, residual: _Float, theta: _Float, zone: _Float, sizes: Sizes
-    ) -> _Float:
+    def _held_out(self, linear: RandomEffects, slope: _Float, residual: _Float, place: Place, sizes: Sizes) -> _Float:
         """Return the residuals of each part of the blocks under what the others tell, by the linearised problem."""
         fold = np.arange(len(self.start)) % FOLDS
         of_frame = np.repeat(fold, np.diff(np.append(self.start, len(residual))))
         after = np.full(residual.shape, np.nan)
         for k in range(min(FOLDS, len(self.start))):
-            step, _ = self.step(linear, theta, zone, sizes, fold != k)
-            change = np.einsum("kpr,p->kr", slope, self.scale * step[: len(self.free)])
+            step, _ = self.step(linear, place, sizes, fold != k)
+            of_slopes, of_zones = np.split(step, [slope.shape[1]])
+            change = np.einsum("kpr,p->kr", slope, of_slopes)
             if self.zones:
-                change = change + _ZONE_UNIT_M * step[len(self.free) :]
+                change = change + _ZONE_UNIT_M * of_zones
             after[of_frame == k] = (residual - change)[of_frame == k]
         return after
 
-    def _sensor_fields(self, zone: _Float, noise: _Noise, systematic: _Float) -> dict[str, object]:
-        """Return zone offsets, noise law and systematic errors as fields of the sensor."""
-        distance, delta, bearing, height, time = systematic.tolist()
-        table = zone.reshape(self.sensor.rows, self.sensor.cols).tolist()
-        fields = {
-            "zone_offset_m": tuple(map(tuple, table)),
-            **dict(zip(("range_std_m", "range_shot_std_m", "range_ambient_std_m"), noise, strict=True)),
-            "systematic_distance_m": distance,
-            "systematic_delta_deg": math.degrees(delta),
-            "systematic_bearing_deg": math.degrees(bearing),
-            "systematic_height_m": height,
-            "systematic_time_s": time,
-        }
+    def _sensor_fields(
+        self, zone: _Float, noise: _Noise, systematic: _Float, recording: RecordingSizes
+    ) -> dict[str, object]:
+        """Return zone offsets, noise law, systematic errors and what recordings differ by as fields of the sensor."""
+        fields: dict[str, object] = {}
+        if self.problem.track is not None:
+            for name, own in RECORDING_FIELDS.items():
+                parameter = next(one for one in PARAMETERS.values() if one.field == name)
+                if parameter.name in self.free:
+                    fields[own] = parameter.in_file * recording.of_another(parameter.name)
+        if self.zones:
+            distance, delta, bearing, height, time = systematic.tolist()
+            table = zone.reshape(self.sensor.rows, self.sensor.cols).tolist()
+            fields |= {
+                "zone_offset_m": tuple(map(tuple, table)),
+                **dict(zip(("range_std_m", "range_shot_std_m", "range_ambient_std_m"), noise, strict=True)),
+                "systematic_distance_m": distance,
+                "systematic_delta_deg": math.degrees(delta),
+                "systematic_bearing_deg": math.degrees(bearing),
+                "systematic_height_m": height,
+                "systematic_time_s": time,
+            }
         return {name: rounded(value) for name, value in fields.items()}
 
 

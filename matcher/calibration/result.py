@@ -14,7 +14,9 @@ from scipy import linalg
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
 from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
 from phasemark.matcher.calibration.problem import Fitted, Solution, rms
+from phasemark.matcher.calibration.recording_effects import own_title
 from phasemark.matcher.likelihood.residuals import ResidualKind
+from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS
 from phasemark.render import Sensor
 from phasemark.render.integral.rounding import error_text, value_and_error, with_error
 from phasemark.render.sensor.lens_fields import DERIVED, TERMS
@@ -84,6 +86,9 @@ class Calibration(Fitted):
         that from the other frames. NaN where it is not known.
     left_out : float
         Share of the pixels that see the landmark by the model, but disagree with it and have no weight.
+    own : tuple of mapping of str to (float, float)
+        What each recording of a moving camera has of its own, with its standard deviation: its difference in numbers of
+        the mounting, and by how much the landmark is turned ("turn") against the axes of its poses.
     """
 
     sensor: Sensor
@@ -147,6 +152,14 @@ class Calibration(Fitted):
             "on": self.on,
             "held_out_rms_mm": dict(zip(("before", "after"), map(_mm, self.held_out_m), strict=True)),
             "left_out": self.left_out,
+            "recordings": [
+                {
+                    name: {"value": factor * value, "std": factor * std, "unit": {"°": "deg"}.get(unit, unit)}
+                    for name, (value, std) in own.items()
+                    for _, factor, unit in (own_title(name),)
+                }
+                for own in self.own
+            ],
             "doubts": list(self.doubts),
             "likely_cause": self.cause or None,
             "residual_rms_mm": {
@@ -187,7 +200,10 @@ class Calibration(Fitted):
                 comments[parameter.field] = f"calibrated, ± {error} (standard deviation)"
         if distortion:
             comments["lens.distortion"] = f"calibrated, {', '.join(distortion)} (standard deviations)"
-        for field, what in _COMMON.items():
+        between = "assumed: by how much two recordings of one sensor differed"
+        if len(self.own) > 1:
+            between = f"calibrated: by how much {len(self.own)} recordings differ"
+        for field, what in {**_COMMON, **dict.fromkeys(RECORDING_FIELDS.values(), between)}.items():
             if field not in comments and getattr(self.sensor, field) != getattr(self.base, field):
                 comments[field] = what
         header = [
@@ -238,7 +254,7 @@ def _mm(value_m: float) -> float | None:
 def concluded(solution: Solution, doubts: tuple[str, ...], cause: str) -> Calibration:
     """Return the calibration that a solution means, with the sensor that it makes."""
     problem, use = solution.problem, solution.use
-    sensor, one, names = problem.sensor, problem.one, problem.names
+    sensor, one, names = problem.sensor, problem.one, problem.common
     mounting = Mounting.of_vector(solution.theta, sensor)
     calibrated = _calibrated(sensor, mounting, names, solution.covariance).with_(**solution.sensor_fields)
     shared = {each.name: getattr(solution, each.name) for each in fields(Fitted)}
@@ -254,7 +270,12 @@ def concluded(solution: Solution, doubts: tuple[str, ...], cause: str) -> Calibr
         assumed=problem.assumed,
         free=names,
         on=problem.on,
-        poses=problem.poses_with(mounting.delay_s),
+        poses=KnownPoses.joined(
+            [
+                one.poses_with(mounting.delay_s + own.get("delay", (0.0, 0.0))[0])
+                for one, own in zip(problem.recordings, solution.own or ({},), strict=True)
+            ]
+        ),
         pose_residuals=use.sum(axis=1) * (1 if problem.on == "ranges" else 2),
         doubts=doubts,
         cause=cause,

@@ -47,7 +47,7 @@ def calibrate_camera(
     bank_or_class: Annotated[str, Shown(autocompletion=a_class)],
     frames: list[Path],
     *,
-    poses: Annotated[Path, Shown(metavar="CSV")],
+    poses: Annotated[list[Path], Shown(metavar="CSV")],
     out: Out,
     class_name: ClassName | None = None,
     sensor: SensorName | None = None,
@@ -86,9 +86,9 @@ def calibrate_camera(
     bank_or_class
         A bank, or a class of the catalogue.
     frames
-        Measured frames: a file for each pose, or one of them all, in order.
+        Measured frames: a file for each pose, or one of them all, in order; with --moving recordings.
     poses
-        Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms].
+        Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms]; once for each recording.
     out
         The sensor file to write, .toml.
     class_name
@@ -136,8 +136,10 @@ def calibrate_camera(
     refuse_existing([out, figure], force)
     background = background_of(wall, floor)
     mesh, base, base_name = _calibration_target(bank_or_class, class_name, sensor)
-    known = read_poses(poses, landmark_xy_m=landmark_xy, landmark_yaw_rad=math.radians(landmark_yaw))
-    note_too_far(base, {f"{poses}: the landmark": max(known.distance_m.tolist(), default=None), "--wall": wall})
+    yaw = math.radians(landmark_yaw)
+    known = [read_poses(path, landmark_xy_m=landmark_xy, landmark_yaw_rad=yaw) for path in poses]
+    farthest_m = max(float(one.distance_m.max()) for one in known)
+    note_too_far(base, {"--poses: the landmark": farthest_m, "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
     fixed = _fixed_names(fix, delay_ms, moving)
     start = _start(base, mesh, albedo, height, bearing, delay_ms)
@@ -152,7 +154,7 @@ def calibrate_camera(
             on=on,
             background=background,
             pose_std=_pose_std(position_std, heading_std, delta_std),
-            reports_z=reading.quantity == "z" or None,
+            reports_z=None if reading.quantity is None else reading.quantity == "z",
             moving=moving,
             zones=zones,
             workers=workers or min(processors(), 4),
@@ -177,17 +179,22 @@ def _pose_std(position: float | None, heading_deg: float | None, delta_deg: floa
 
 
 def _filtered(
-    measured: Sequence[Frames], known: KnownPoses, on: Literal["auto", "ranges", "phasors"], moving: bool
-) -> FilteredFrames:
-    """Return the frames of a moving camera one by one, and those of a still one averaged at each pose."""
+    measured: Sequence[Frames], known: Sequence[KnownPoses], on: Literal["auto", "ranges", "phasors"], moving: bool
+) -> list[FilteredFrames]:
+    """Return the frames of each recording one by one, and those of a still camera averaged at each pose."""
     from phasemark.matcher import kalman_filter
     from phasemark.matcher.calibration import filter_poses, frames_of_poses
 
-    if not moving:
-        return filter_poses(frames_of_poses(measured, known), on)
-    if len(measured) != 1:
-        raise UsageError(f"--moving takes one recording, got {len(measured)} files")
-    return kalman_filter(measured[0].each_a_position())
+    if moving:
+        if len(measured) != len(known):
+            raise UsageError(
+                f"--moving takes a file of poses for each recording, got {len(measured)} recordings and {len(known)}"
+                " --poses"
+            )
+        return [kalman_filter(one.each_a_position()) for one in measured]
+    if len(known) != 1:
+        raise UsageError(f"still poses are one file of them all, got {len(known)} --poses (recordings take --moving)")
+    return [filter_poses(frames_of_poses(measured, known[0]), on)]
 
 
 def _fixed_names(fix: str | None, delay_ms: float | None, moving: bool) -> list[str]:
@@ -277,6 +284,7 @@ def _echo_calibration(found: Calibration) -> None:
                 for name, row in zip(found.free, found.correlation, strict=True)
             ),
         )
+    _echo_recordings(found)
     test = f"χ² = {found.chi2:.6g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}"
     echo("", test, f"standard deviations from {found.covariance_from}")
     before, after = found.held_out_m
@@ -284,3 +292,18 @@ def _echo_calibration(found: Calibration) -> None:
         echo(f"residuals of held-out frames, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after")
     echo(*(f"note: {note}" for note in found.notes))
     echo(*(f"not to be trusted: {doubt}; likely cause: {found.cause}" for doubt in found.doubts))
+
+
+def _echo_recordings(found: Calibration) -> None:
+    """Print what each recording has of its own, if there are several."""
+    from phasemark.matcher.calibration.recording_effects import own_title
+
+    if len(found.own) < 2:
+        return
+    rows = []
+    titles = [own_title(name) for name in found.own[0]]
+    for k, own in enumerate(found.own, 1):
+        numbers = zip(own.values(), titles, strict=True)
+        rows.append((str(k), *(f"{by * value:+.2f} ± {by * std:.2f}" for (value, std), (_, by, _) in numbers)))
+    echo("\nrecordings, less what they share")
+    echo_table(("", *(f"{title} ({unit})" for title, _, unit in titles)), rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +15,13 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.likelihood.systematic import (
+    Carried,
     Systematic,
-    calibrated_covariance,
-    calibrated_fields,
     calibrated_slopes,
-    carried_covariance,
+    carried_covariances,
+    carried_errors,
     declared_covariance,
+    fields_of,
     rates_of_views,
 )
 from phasemark.matcher.match import Match
@@ -39,14 +40,14 @@ def with_shared_errors(
     evidence: Evidence,
     answers: list[Match],
 ) -> list[Match]:
-    """Add what the calibration of a sensor leaves, and what the sensor declares.
+    """Add what the calibration of a sensor leaves, what differs in another recording, and what the sensor declares.
 
     Parameters
     ----------
     setup : Setup
     rendered : callable
         Returns what renders the landmarks; called where a calibration has to be carried into a view.
-    systematic : collection of {"calibration", "declared", "motion"}
+    systematic : collection of {"calibration", "recording", "declared", "motion"}
     sensor : Sensor
         Of the frames.
     evidence : Evidence
@@ -59,13 +60,14 @@ def with_shared_errors(
     if "declared" in systematic and declared.any():
         for k in known:
             parts[k]["declared"] = declared
-    if "calibration" in systematic and calibrated_fields(sensor):
+    if terms := carried_errors(sensor, systematic):
         for c, name in enumerate(setup.rules.names):
             which = [k for k in known if answers[k].class_name == name]
             if which:
-                carried = _carried(setup, rendered(), sensor, evidence, c, which, [answers[k] for k in which])
-                for k, part in zip(which, carried, strict=True):
-                    parts[k]["calibration"] = part
+                carried = _carried(setup, rendered(), sensor, evidence, c, which, [answers[k] for k in which], terms)
+                for term, some in carried.items():
+                    for k, part in zip(which, some, strict=True):
+                        parts[k][term] = part
     return [with_parts(setup.rules, match, part) if part else match for match, part in zip(answers, parts, strict=True)]
 
 
@@ -110,8 +112,9 @@ def _carried(
     class_index: int,
     which: list[int],
     matches: list[Match],
-) -> NDArray[np.float64]:
-    """Return what a calibration leaves of the views of some frames with one class and background, (k, p, p)."""
+    terms: Mapping[Systematic, Carried],
+) -> dict[Systematic, NDArray[np.float64]]:
+    """Return what errors of the sensor's fields make of the views of some frames of one class, (k, p, p) each."""
     background, renderer = matches[0].background, model.renderer(class_index)
     views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
     image = renderer.render_views(views, background=background)
@@ -122,7 +125,7 @@ def _carried(
     if setup.on == "phasors":  # the albedo, which is fitted too, takes up part of an error
         alone = image if background is None else renderer.render_views(views)
         slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
-    by_fields = calibrated_slopes(renderer, sensor, views, image, background)
+    by_fields = calibrated_slopes(renderer, sensor, views, image, background, fields_of(terms))
     use = counts(image.phasor, image.intensity, sensor).reshape(len(which), -1) & setup.used
     weight = np.where(use, evidence.weight[which], 0.0)
     phasor = image.phasor.reshape(len(which), -1)
@@ -142,4 +145,5 @@ def _carried(
     if setup.prior_std:
         information[:, :p, :p] += np.diag(np.array(setup.prior_std) ** -2.0)
     inverse = covariance_of(information, weak="none")
-    return carried_covariance(inverse, rows, whitened(by_fields), calibrated_covariance(sensor))[:, :p, :p]
+    carried = carried_covariances(inverse, rows, whitened(by_fields), terms)
+    return {term: part[:, :p, :p] for term, part in carried.items()}

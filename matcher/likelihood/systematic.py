@@ -1,16 +1,17 @@
 """Errors that all frames of a camera share, carried into the covariance of a view.
 
-A calibration leaves the fields κ of a sensor uncertain, with covariance C. With the Jacobian J of the residuals by the
-view, their weights W and the covariance P = (Jᵀ W J)⁻¹, an error δκ moves the estimate by −P Jᵀ W (∂f/∂κ) δκ to first
-order. So the covariance of the view grows by G C Gᵀ with G = P Jᵀ W ∂f/∂κ. Averaging frames does not reduce it. What a
-sensor declares beside that (`systematic_distance_m` and its neighbours) is added to the variances.
+A calibration leaves the fields κ of a sensor uncertain, with covariance C, and from one recording to the next some of
+them differ, by `recording_range_m` and its neighbours. With the Jacobian J of the residuals by the view, their weights
+W and the covariance P = (Jᵀ W J)⁻¹, an error δκ moves the estimate by −P Jᵀ W (∂f/∂κ) δκ to first order. So the
+covariance of the view grows by G C Gᵀ with G = P Jᵀ W ∂f/∂κ. Averaging frames does not reduce it. What a sensor
+declares beside that (`systematic_distance_m` and its neighbours) is added to the variances.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
-from typing import Literal, get_args
+from collections.abc import Collection, Mapping, Sequence
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +21,9 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import LENS_FIELD
 from phasemark.render.sensor.lens_rates import lens_rates
 
-Systematic = Literal["calibration", "declared", "motion"]
-"""What a calibration leaves of the sensor's fields, what the sensor declares of a pose, and the jitter of stamps."""
+Systematic = Literal["calibration", "recording", "declared", "motion"]
+"""What a calibration leaves of the sensor's fields, what differs in another recording, what the sensor declares of a
+pose, and the jitter of stamps."""
 SYSTEMATICS: tuple[Systematic, ...] = get_args(Systematic)
 
 _STEPS = {
@@ -33,6 +35,13 @@ _STEPS = {
     "height_offset_m": 2e-4,
 }
 """Fields that move an image, and the width of a difference in them."""
+RECORDING_FIELDS = {
+    "range_offset_m": "recording_range_m",
+    "pitch_deg": "recording_pitch_deg",
+    "roll_deg": "recording_roll_deg",
+    "bearing_offset_deg": "recording_bearing_deg",
+}
+"""Fields that differ from one recording to the next, and those that say how much."""
 _LENS_STEP_RAD = math.radians(0.02)
 """How far the width of a difference in a term of the lens moves the point of an image that it moves most."""
 _OFFSET = "range_offset_m"
@@ -106,17 +115,35 @@ def rates_of_views(
     return rate
 
 
-def calibrated_fields(sensor: Sensor) -> tuple[str, ...]:
-    """Return which of a sensor's calibrated fields move what a frame shows."""
-    return tuple(
-        name for name in sensor.calibration_fields if name in _STEPS or name == _OFFSET or name.startswith(LENS_FIELD)
-    )
+class Carried(NamedTuple):
+    """Fields of a sensor whose errors are carried into views, with the covariance (c, c) in their units."""
+
+    fields: tuple[str, ...]
+    covariance: NDArray[np.float64]
 
 
-def calibrated_covariance(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the covariance of :func:`calibrated_fields`, (c, c), in the units of the fields."""
-    which = [sensor.calibration_fields.index(name) for name in calibrated_fields(sensor)]
-    return np.asarray(sensor.calibration_matrix[np.ix_(which, which)])
+def carried_errors(sensor: Sensor, terms: Collection[str]) -> dict[Systematic, Carried]:
+    """Return what the fields of a sensor leave uncertain of what a frame shows, of some terms; no empty ones.
+
+    Parameters
+    ----------
+    sensor : Sensor
+    terms : collection of {"calibration", "recording", "declared", "motion"}
+        The last two are not carried by fields.
+    """
+    found: dict[Systematic, Carried] = {}
+    if "calibration" in terms:
+        which = [
+            k
+            for k, name in enumerate(sensor.calibration_fields)
+            if name in _STEPS or name == _OFFSET or name.startswith(LENS_FIELD)
+        ]
+        names = tuple(sensor.calibration_fields[k] for k in which)
+        found["calibration"] = Carried(names, np.asarray(sensor.calibration_matrix[np.ix_(which, which)]))
+    if "recording" in terms:
+        std = {name: float(getattr(sensor, own)) for name, own in RECORDING_FIELDS.items() if getattr(sensor, own)}
+        found["recording"] = Carried(tuple(std), np.diag(np.square(list(std.values()))))
+    return {name: one for name, one in found.items() if one.fields}
 
 
 def calibrated_slopes(
@@ -125,9 +152,10 @@ def calibrated_slopes(
     views: Views,
     image: PhasorImages,
     background: Background | None,
+    names: Sequence[str],
     workers: int = 1,
 ) -> NDArray[np.complex128]:
-    """Return ∂S/∂κ of the calibrated fields, (n, c, rows, cols), in units of |S| over the unit of the field.
+    """Return ∂S/∂κ of some fields, (n, c, rows, cols), in units of |S| over the unit of the field.
 
     The range offset is taken off measured frames, and a sensor that reports z has its ranges made with its half angles:
     what that changes in the measured phase counts with the other sign.
@@ -142,10 +170,11 @@ def calibrated_slopes(
     image : PhasorImages
         What is seen at the views.
     background : Background, optional
+    names : sequence of str
+        The fields.
     workers : int
         Threads.
     """
-    names = calibrated_fields(sensor)
     phasor = image.phasor
     out = np.empty((len(phasor), len(names), *phasor.shape[1:]), np.complex128)
     by_range = 1j * phasor / sensor.metres_per_radian
@@ -175,13 +204,18 @@ def _beside(sensor: Sensor, name: str) -> tuple[Sensor, float]:
         return sensor.with_numbers({name: value - step}), -step
 
 
-def carried_covariance(
+def fields_of(terms: Mapping[Systematic, Carried]) -> tuple[str, ...]:
+    """Return the fields of all terms, each once."""
+    return tuple(dict.fromkeys(name for one in terms.values() for name in one.fields))
+
+
+def carried_covariances(
     covariance: NDArray[np.float64],
     rows: NDArray[np.float64],
-    calibrated_rows: NDArray[np.float64],
-    calibrated: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    """Return G C Gᵀ with G = P Jᵀ W K, (n, p, p).
+    rows_of_fields: NDArray[np.float64],
+    terms: Mapping[Systematic, Carried],
+) -> dict[Systematic, NDArray[np.float64]]:
+    """Return G C Gᵀ with G = P Jᵀ W K of each term, (n, p, p).
 
     Parameters
     ----------
@@ -189,10 +223,14 @@ def carried_covariance(
         P, of noise alone.
     rows : (n, p, residuals) float64
         Whitened Jacobian √W J by the view, transposed.
-    calibrated_rows : (n, c, residuals) float64
-        Whitened Jacobian √W K by the calibrated fields, transposed.
-    calibrated : (c, c) float64
-        C.
+    rows_of_fields : (n, c, residuals) float64
+        Whitened Jacobian √W K by :func:`fields_of` the terms, transposed.
+    terms : mapping of str to Carried
     """
-    gain = covariance @ (rows @ calibrated_rows.transpose(0, 2, 1))
-    return np.asarray(gain @ calibrated @ gain.transpose(0, 2, 1))
+    gain = covariance @ (rows @ rows_of_fields.transpose(0, 2, 1))
+    names = fields_of(terms)
+    found: dict[Systematic, NDArray[np.float64]] = {}
+    for term, one in terms.items():
+        own = gain[:, :, [names.index(name) for name in one.fields]]
+        found[term] = np.asarray(own @ one.covariance @ own.transpose(0, 2, 1))
+    return found

@@ -161,6 +161,9 @@ class Sensor(SensorQuantities):
     systematic_time_s : float
         Standard deviation of the jitter of the stamps, seconds. While the camera moves, a stamp that is off by that
         much moves the pose by that time's motion.
+    recording_range_m, recording_pitch_deg, recording_roll_deg, recording_bearing_deg : float
+        Standard deviation by which range offset, tilt and bearing of another recording differ from those of this file:
+        what putting the camera on again, temperature and the reference of the poses change.
 
     Raises
     ------

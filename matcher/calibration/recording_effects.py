@@ -1,0 +1,116 @@
+"""Differences between recordings of one camera.
+
+The camera is put on again, is warmer, and the poses are told in another frame: range offset, bearing, pitch, roll and
+delay of a recording are those of the camera plus an error of its own, and a landmark may be turned against the axes of
+the poses. Each error is normal with a variance that all recordings share. With n recordings the variance has an inverse
+gamma prior that is worth three recordings of the usual size, and is found by expectation maximisation of the restricted
+likelihood (Dempster, Laird & Rubin 1977): the expected squares of the errors given the frames, averaged with the prior.
+As so few recordings leave the variance uncertain, what is stated for another recording is its posterior mean, the
+variance of Student's t in place of a normal law.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.calibration.mounting import PARAMETERS
+
+_Float = NDArray[np.float64]
+
+TURN = "turn"
+"""By how much the landmark is turned against the axes of the poses, counter-clockwise: no number of the camera."""
+BETWEEN_RANGE_M, BETWEEN_ANGLE_RAD = 0.005, math.radians(0.8)
+"""Standard deviation of the difference of two recordings, where there is but one: measured on recordings of a VL53L5CX
+on a drone, whose range offsets were 6 and 15 mm, pitches 0.5° and 2.4°, bearings up to 1.2° apart."""
+_USUAL = {
+    "range_offset": BETWEEN_RANGE_M / math.sqrt(2),
+    "bearing": BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "pitch": BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "roll": BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "delay": 0.2,
+    TURN: math.radians(0.5),
+}
+"""Usual standard deviations of the errors of a recording, metres, radians, seconds."""
+_WORTH = 3.0
+"""Recordings that the usual sizes are worth."""
+_ROUNDS = 50
+
+
+def own_names(free: tuple[str, ...], recordings: int, *, moving: bool) -> tuple[str, ...]:
+    """Return the names of what each recording may have of its own: of a single one the landmark's turn alone."""
+    names = tuple(name for name in _USUAL if name in free) if recordings > 1 else ()
+    return (*names, TURN) if moving else names
+
+
+@dataclass(frozen=True)
+class RecordingSizes:
+    """Standard deviations of what recordings have of their own.
+
+    Parameters
+    ----------
+    names : tuple of str
+    recordings : int
+    std : (q,) float64
+        Metres, radians, seconds.
+    """
+
+    names: tuple[str, ...]
+    recordings: int
+    std: _Float
+
+    @classmethod
+    def usual(cls, names: tuple[str, ...], recordings: int) -> RecordingSizes:
+        """Return the sizes before a frame is seen."""
+        return cls(names, recordings, np.array([_USUAL[name] for name in names]))
+
+    def most_likely(
+        self, information: _Float, gradient: _Float, prior: _Float, own: _Float, first: int
+    ) -> RecordingSizes:
+        """Return the sizes after the frames of all recordings.
+
+        Parameters
+        ----------
+        information, gradient : (P, P), (P,) float64
+            Of all parameters, of which the errors of the recordings stand together, without their prior.
+        prior : (P,) float64
+            Precision of the others; what it says of the errors is not read.
+        own : (R, q) float64
+            Errors of the recordings where the gradient was taken.
+        first : int
+            Where they begin among the parameters, whose unit they have.
+        """
+        usual = RecordingSizes.usual(self.names, self.recordings).std
+        std, count = self.std, own.size
+        for _ in range(_ROUNDS):
+            precision = prior.copy()
+            precision[first : first + count] = np.tile(std**-2.0, self.recordings)
+            pull = gradient.copy()
+            pull[first : first + count] -= precision[first : first + count] * own.ravel()
+            covariance = np.linalg.inv(information + np.diag(precision))
+            there = own.ravel() + (covariance @ pull)[first : first + count]
+            square = (there**2 + np.diag(covariance)[first : first + count]).reshape(own.shape).sum(axis=0)
+            std = np.sqrt((_WORTH * usual**2 + square) / (_WORTH + self.recordings))
+        known = _WORTH + self.recordings - 1
+        return RecordingSizes(self.names, self.recordings, std * math.sqrt(known / (known - 2)))
+
+    def of_another(self, name: str) -> float:
+        """Return by how much another recording differs from the calibrated number, standard deviation.
+
+        Of a single recording that is the difference of two; of several the camera's number is the one between them,
+        and its own error is in its covariance.
+        """
+        if self.recordings == 1:
+            return math.sqrt(2) * _USUAL[name]
+        return float(self.std[self.names.index(name)]) if name in self.names else 0.0
+
+
+def own_title(name: str) -> tuple[str, float, str]:
+    """Return the title of a recording's own number, its factor for people, and its unit."""
+    if name == TURN:
+        return "turn of the landmark", math.degrees(1), "°"
+    one = PARAMETERS[name]
+    return one.title, one.shown, one.unit
