@@ -138,8 +138,7 @@ def calibrate_camera(
     mesh, base, base_name = _calibration_target(bank_or_class, class_name, sensor)
     yaw = math.radians(landmark_yaw)
     known = [read_poses(path, landmark_xy_m=landmark_xy, landmark_yaw_rad=yaw) for path in poses]
-    farthest_m = max(float(one.distance_m.max()) for one in known)
-    note_too_far(base, {"--poses: the landmark": farthest_m, "--wall": wall})
+    note_too_far(base, {"--poses: the landmark": max(one.distance_m.max() for one in known), "--wall": wall})
     filtered = _filtered([reading.read(path, base) for path in frames], known, on, moving)
     fixed = _fixed_names(fix, delay_ms, moving)
     start = _start(base, mesh, albedo, height, bearing, delay_ms)
