@@ -1,5 +1,6 @@
 """Maximum likelihood: at the bound, over the seam, honest about itself, and quiet where there is no landmark."""
 
+import functools
 import json
 import math
 from dataclasses import replace
@@ -42,6 +43,25 @@ def bank(tmp_path_factory):
     plan = BankPlan(distance_m="0.75:1.65:0.01", delta_deg="0:180:1")
     with build_bank(plan, tmp_path_factory.mktemp("bank") / "bank.h5") as opened:
         yield opened
+
+
+@pytest.fixture(scope="module")
+def matcher_of(bank):
+    """Return a function from options to their matcher of the bank, which is made once."""
+    return functools.cache(lambda **options: Matcher(bank, "refine", **options))
+
+
+@pytest.fixture(scope="module")
+def bank_of_two():
+    """Two classes alone: a frame without sense takes seconds a class."""
+    with build_bank(BankPlan(classes=("cone", "post"), distance_m="0.75:1.65:0.01", delta_deg="0:180:1")) as bank:
+        yield bank
+
+
+@pytest.fixture(scope="module")
+def two_matchers(bank_of_two):
+    """Without a background, and with one that is found."""
+    return tuple(Matcher(bank_of_two, "refine", free=VIEW[:2], background=background) for background in (None, "auto"))
 
 
 @pytest.fixture(scope="module")
@@ -88,9 +108,9 @@ def test_rendered_images_are_the_renderers_own_with_its_jacobian(bank, renderers
 
 
 @pytest.mark.parametrize("delta_deg", [0.003, 179.997, 0.0, 90.0, 45.3])
-def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_turns(bank, renderers, delta_deg):
+def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_turns(matcher_of, renderers, delta_deg):
     image = renderers["sphere"].render(1.0234, math.radians(delta_deg))
-    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
+    match = matcher_of().match(noise_free(image, 50))[0]
     assert match.class_name == "sphere"
     assert match.distance_m == pytest.approx(1.0234, abs=1e-4)  # a third of the bound of 50 frames
     error = math.remainder(match.delta_rad - math.radians(delta_deg), math.pi)
@@ -100,17 +120,17 @@ def test_a_noise_free_view_is_found_exactly_over_the_seam_and_at_the_quarter_tur
 
 
 @pytest.mark.parametrize("distance_m", [0.7501, 1.6499])
-def test_views_in_the_last_cells_of_the_grid_are_found(bank, renderers, distance_m):
+def test_views_in_the_last_cells_of_the_grid_are_found(matcher_of, renderers, distance_m):
     image = renderers["cylinder"].render(distance_m, 0.7)
-    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
+    match = matcher_of().match(noise_free(image, 50))[0]
     assert match.distance_m == pytest.approx(distance_m, abs=2e-4)
     assert match.accepted
 
 
-def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so(bank, renderers):
+def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so(matcher_of, renderers):
     # N = 500 over the four classes; 99.9 % intervals over 7 figures
     rng = np.random.default_rng(20)
-    match = Matcher(bank, "refine", free=VIEW[:2]).match
+    match = matcher_of(free=VIEW[:2]).match
     errors = [run_trials(match, renderers[name], name, TrialSetup(), 125, rng) for name in NAMES]
     for trials in errors:
         assert (trials.found == trials.class_name).all()
@@ -133,10 +153,10 @@ def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so
     assert accepted > 0.985 - z * math.sqrt(0.01 / n)
 
 
-def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(bank, renderers):
+def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(matcher_of, renderers):
     # N = 40: a matcher that stops at a side peak, or at ranges of the landmark alone, is off by tens of bounds
     setup = TrialSetup(background=WALL)
-    matcher = Matcher(bank, "refine", free=VIEW[:2], background=WALL)
+    matcher = matcher_of(free=VIEW[:2], background=WALL)
     trials = run_trials(matcher.match, renderers["cone"], "cone", setup, 40, np.random.default_rng(2))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 38
@@ -145,11 +165,11 @@ def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(bank, ren
     assert median_deg < 0.06  # PHYSICS section 7: 0.03° at 1 m, and these go to 1.6 m
 
 
-def test_on_phasors_the_albedo_does_not_matter(bank):
+def test_on_phasors_the_albedo_does_not_matter(bank, matcher_of):
     # 30 % darker than the bank has it; N = 30
     dark = Renderer(build_mesh(catalog()["cylinder"]), SENSOR, albedo=0.56)
     setup = TrialSetup(on="phasors", distance_m=(0.8, 1.2))
-    matcher = Matcher(bank, "refine", free=VIEW[:2], on="phasors")
+    matcher = matcher_of(free=VIEW[:2], on="phasors")
     trials = run_trials(matcher.match, dark, "cylinder", setup, 30, np.random.default_rng(3))
     inner = trials.scaled[~trials.outlier]
     assert len(inner) >= 29
@@ -157,9 +177,9 @@ def test_on_phasors_the_albedo_does_not_matter(bank):
     assert trials.accepted.mean() > 0.85  # 99 % minus 3.3 σ of 30
 
 
-def test_trials_of_a_matcher_that_estimates_something_else_are_refused(bank, renderers):
+def test_trials_of_a_matcher_that_estimates_something_else_are_refused(matcher_of, renderers):
     with pytest.raises(UsageError, match="estimates distance_m, delta_rad, bearing_rad, and 'free'"):
-        run_trials(Matcher(bank, "refine").match, renderers["cone"], "cone", TrialSetup(), 1, np.random.default_rng(1))
+        run_trials(matcher_of().match, renderers["cone"], "cone", TrialSetup(), 1, np.random.default_rng(1))
 
 
 @pytest.mark.parametrize("background", [None, Background(wall_m=2.5), Background(floor_m=0.3)])
@@ -248,12 +268,12 @@ def test_the_whole_cost_counts_each_contradicted_and_each_undecided_pixel_once(b
     assert contradicted.all()
 
 
-def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, renderers):
-    view = Views.broadcast([0.9, 1.2], [0.5, 2.0])
+def test_an_automatic_background_finds_the_wall_and_the_view_before_it(matcher_of, renderers):
+    view = Views.broadcast([1.2], [2.0])
     wall = Background(wall_m=3.3, wall_albedo=0.4)
     frames = noisy_frames(renderers["sphere"], SENSOR, view, TrialSetup(background=wall), np.random.default_rng(6))
     for match, distance, delta in zip(
-        Matcher(bank, "refine", background="auto").match(frames), view.distance_m, view.delta_rad, strict=True
+        matcher_of(background="auto").match(frames), view.distance_m, view.delta_rad, strict=True
     ):
         assert match.class_name == "sphere"
         assert match.accepted
@@ -263,11 +283,12 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(bank, ren
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
+@pytest.mark.parametrize("names", [("cone", "post"), pytest.param(("cylinder", "sphere"), marks=pytest.mark.soak)])
 @pytest.mark.parametrize("wall_m", [None, 2.2])
-def test_what_stands_behind_is_found_and_then_costs_few_views_more(bank, renderers, wall_m):
+def test_what_stands_behind_is_found_and_then_costs_few_views_more(matcher_of, renderers, wall_m, names):
     behind, rng = None if wall_m is None else Background(wall_m=wall_m), np.random.default_rng(8)
-    matcher, plain = Matcher(bank, "refine", background="auto"), Matcher(bank, "refine")
-    for name in NAMES:
+    matcher, plain = matcher_of(background="auto"), matcher_of()
+    for name in names:
         view = Views.broadcast(rng.uniform(0.8, 1.4), rng.uniform(0, 3))
         frames = noisy_frames(renderers[name], SENSOR, view, TrialSetup(background=behind, n_frames=5), rng)
         found = matcher.match(frames)[0]
@@ -278,7 +299,7 @@ def test_what_stands_behind_is_found_and_then_costs_few_views_more(bank, rendere
 
 @pytest.mark.parametrize("free", [VIEW[:2], pytest.param(VIEW[:3], marks=pytest.mark.soak)])
 def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(bank, renderers, free):
-    behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)] * 2
+    behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)]
     rng = np.random.default_rng(7)
     frames: list[FilteredFrames] = []
     for k, own in enumerate(behind):
@@ -297,7 +318,7 @@ def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(ba
         assert match.delta_rad == pytest.approx(expected.delta_rad, abs=1e-5)
         assert match.chi2 == pytest.approx(expected.chi2, rel=1e-6)
         assert (match.background is None) == (expected.background is None)
-    assert sum(match.accepted for match in together) >= 6
+    assert sum(match.accepted for match in together) >= 3
 
 
 def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank, renderers):
@@ -356,12 +377,12 @@ def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers,
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("cone", 24), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
+    ("name", "n"), [("cone", 8), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
 )
-def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(bank, renderers, name, n):
+def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(matcher_of, renderers, name, n):
     """A floor that cuts the landmark moves its lower edge; wall, floor and view share what the frame tells."""
     setup = TrialSetup(background=Background(wall_m=3.0, floor_m=0.25), nuisances=("wall_m",))
-    matcher = Matcher(bank, "refine", free=VIEW[:2], background="auto")
+    matcher = matcher_of(free=VIEW[:2], background="auto")
     trials = run_trials(matcher.match, renderers[name], name, setup, n, np.random.default_rng(11))
     wrong = trials.accepted & ((trials.found != name) | (np.abs(trials.error[:, 0]) > 0.03))
     assert not wrong.any()
@@ -377,16 +398,16 @@ def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(ba
 @pytest.mark.parametrize(
     ("name", "free", "n"),
     [
-        *((name, VIEW[:2], 40) for name in STRANGERS),
-        ("cube", None, 3),
+        *((name, VIEW[:2], 20) for name in STRANGERS),
+        ("cube", None, 2),
         *(pytest.param(name, None, 3, marks=pytest.mark.soak) for name in STRANGERS if name != "cube"),
     ],
 )
-def test_a_stranger_on_the_same_box_is_refused(bank, name, free, n):
+def test_a_stranger_on_the_same_box_is_refused(matcher_of, name, free, n):
     rng = np.random.default_rng(8)
     renderer = Renderer(strangers()[name], SENSOR, albedo=0.8)
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
-    matcher = Matcher(bank, "refine", free=free)
+    matcher = matcher_of(free=free)
     images = renderer.render_views(views)
     noncentrality = matcher.match(noise_free(images, 50)).chi2  # after refitting the view, of the nearest class
     far = noncentrality >= 150
@@ -398,17 +419,18 @@ def test_a_stranger_on_the_same_box_is_refused(bank, name, free, n):
 
 @pytest.mark.parametrize("background", [None, "auto", "known"])
 @pytest.mark.parametrize("scene", ["wall", "empty"])
-def test_a_scene_without_a_landmark_is_none(bank, background, scene):
+def test_a_scene_without_a_landmark_is_none(bank_of_two, background, scene):
     behind = Background(wall_m=3.0) if scene == "wall" else None
-    image = Renderer(None, SENSOR).render(np.ones(2), background=behind)
+    image = Renderer(None, SENSOR).render(1.0, background=behind)
     frames = kalman_filter(capture(image, SENSOR, rng=np.random.default_rng(9), n_frames=50))
-    matches = Matcher(bank, "refine", background=behind if background == "known" else background).match(frames)
+    matcher = Matcher(bank_of_two, "refine", background=behind if background == "known" else background)
+    matches = matcher.match(frames)
     assert not matches.accepted.any()
     if background is not None or scene == "empty":
         assert all(name is None for name in matches.class_name)
 
 
-def test_a_hidden_column_is_refused_and_robust_residuals_place_the_rest(bank, renderers):
+def test_a_hidden_column_is_refused_and_robust_residuals_place_the_rest(matcher_of, renderers):
     rng, n = np.random.default_rng(12), 25
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
     image = renderers["cone"].render_views(views)
@@ -416,20 +438,20 @@ def test_a_hidden_column_is_refused_and_robust_residuals_place_the_rest(bank, re
     image.phasor[:, :, 6] = 0.8 / near**2 * np.exp(1j * near / SENSOR.metres_per_radian)
     image.intensity[:, :, 6] = 0.8 / near**2
     frames = kalman_filter(capture(image, SENSOR, rng=rng, n_frames=50))
-    assert not Matcher(bank, "refine", free=VIEW[:2]).match(frames).accepted.any()
-    matches = Matcher(bank, "refine", free=VIEW[:2], robust=True).match(frames)
+    assert not matcher_of(free=VIEW[:2]).match(frames).accepted.any()
+    matches = matcher_of(free=VIEW[:2], robust=True).match(frames)
     assert (matches.class_name == "cone").mean() >= 0.9
     assert not matches.accepted.any()
     # a fifteenth of the pixels is lost: the errors are those of the whole frame, 0.3 mm at 1 m
     assert np.median(np.abs(matches.distance_m - views.distance_m)) < 0.5e-3
 
 
-def test_a_camera_with_unknown_offsets_still_gets_class_and_view_but_is_not_accepted(bank, renderers):
+def test_a_camera_with_unknown_offsets_still_gets_class_and_view_but_is_not_accepted(matcher_of, renderers):
     rng, n = np.random.default_rng(13), 25
     views = Views.broadcast(rng.uniform(0.8, 1.2, n), rng.uniform(0, np.pi, n))
     frames = kalman_filter(capture(renderers["cone"].render_views(views), SENSOR, rng=rng, n_frames=50))
     off = frames.range_m + rng.normal(0, 0.02, (16, 16))  # seven times what noise leaves in a pixel
-    matches = Matcher(bank, "refine", free=VIEW[:2]).match(replace(frames, range_m=off))
+    matches = matcher_of(free=VIEW[:2]).match(replace(frames, range_m=off))
     assert (matches.class_name == "cone").mean() >= 0.9
     assert not matches.accepted.any()
     assert np.median(np.abs(matches.distance_m - views.distance_m)) < 10e-3
@@ -470,17 +492,17 @@ def test_rendering_only_the_rows_that_turn_gives_the_whole_image(bank, on):
     np.testing.assert_allclose(turned.sums.cost, anew.sums.cost, rtol=1e-2)
 
 
-def test_lower_pixels_alone_can_give_the_view(bank, renderers):
+def test_lower_pixels_alone_can_give_the_view(matcher_of, renderers):
     frames = noisy_frames(renderers["cone"], SENSOR, Views.broadcast(1.0, 0.8), TrialSetup(), np.random.default_rng(10))
-    lower = Matcher(bank, "refine", pixels="lower").match(frames)[0]
-    both = Matcher(bank, "refine").match(frames)[0]
+    lower = matcher_of(pixels="lower").match(frames)[0]
+    both = matcher_of().match(frames)[0]
     assert lower.class_name == "cone"
     assert lower.covariance[0, 0] > 1.1 * both.covariance[0, 0]
 
 
-def test_a_match_tells_weights_condition_and_weak_direction(bank, renderers):
+def test_a_match_tells_weights_condition_and_weak_direction(matcher_of, renderers):
     image = renderers["cylinder"].render(1.3, 0.5)
-    match = Matcher(bank, "refine").match(noise_free(image, 50))[0]
+    match = matcher_of().match(noise_free(image, 50))[0]
     assert sum(match.class_probability.values()) == pytest.approx(1)
     assert match.class_probability["cylinder"] > 0.99
     assert {other.class_name for other in match.alternatives} >= {"cone", "sphere", "post"}
@@ -516,20 +538,12 @@ def test_wrong_options_are_refused_in_one_line(bank, options, message, method):
     assert "\n" not in str(error.value)
 
 
-def test_phasors_of_frames_without_amplitude_are_refused(bank):
+def test_phasors_of_frames_without_amplitude_are_refused(matcher_of):
     with pytest.raises(UsageError, match="needs frames with amplitude"):
-        Matcher(bank, "refine", on="phasors").match(kalman_filter(Frames(np.ones((2, 16, 16)), sensor=SENSOR)))
-
-
-@pytest.fixture(scope="module")
-def two_matchers():
-    """Without a background and with one that is found, of two classes: a frame without sense takes a second a class."""
-    plan = BankPlan(classes=("cone", "post"), distance_m="0.75:1.65:0.01", delta_deg="0:180:1")
-    with build_bank(plan) as bank:
-        yield tuple(Matcher(bank, "refine", free=VIEW[:2], background=background) for background in (None, "auto"))
+        matcher_of(on="phasors").match(kalman_filter(Frames(np.ones((2, 16, 16)), sensor=SENSOR)))
 
 
 @given(**DAMAGE)
-@settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_damaged_frames_get_an_answer_and_never_a_view_that_is_not_a_number(two_matchers, renderers, **damage):
     check_damaged(two_matchers, renderers["post"], **damage)
