@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from thin_landmarks import GROSS_M, GROSS_RAD, PRESETS, SETTINGS, WALL, bank_of, box, count, meshes
+from scipy.stats import binom
+from thin_landmarks import COARSE, FINE, GROSS_M, GROSS_RAD, PRESETS, SETTINGS, WALL, bank_of, box, count, meshes
 
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank, open_bank
@@ -18,7 +19,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, disagrees
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
 DIRECT = preset("vl53l5cx-8x8")
-PLATES = np.array([0.608, 0.625, 0.569, 0.605]), np.radians([8.4, 1.4, 24.5, 14.2])
+PLATES = np.array([0.608, 0.569]), np.radians([8.4, 24.5])
 NEAR = tuple(np.round(np.arange(0.6, 0.901, 0.01), 3).tolist())
 
 
@@ -26,7 +27,7 @@ NEAR = tuple(np.round(np.arange(0.6, 0.901, 0.01), 3).tolist())
 def thin_bank(tmp_path_factory):
     """Return a function from the name of a landmark and of a sensor to their bank, which is built once."""
     folder = tmp_path_factory.mktemp("thin")
-    return functools.cache(lambda name, sensor: bank_of(name, sensor, folder))
+    return functools.cache(lambda name, sensor, distance=COARSE: bank_of(name, sensor, folder, distance))
 
 
 @pytest.fixture(scope="module")
@@ -77,13 +78,15 @@ def test_a_return_costs_a_disagreement_where_the_model_has_no_light():
 
 @pytest.mark.parametrize("setting", SETTINGS)
 def test_an_accepted_answer_on_a_thin_panel_is_right(panel, setting):
-    found = count(panel, setting, 25, 1, np.random.default_rng(5))
+    found = count(panel, setting, 12, 1, np.random.default_rng(5))
     assert found.wrong_accepted == 0
     if setting in ("fixed", "wall", "robust"):
-        assert found.right_accepted >= 23  # 25 at a false alarm of 0.01: 3 refused have a probability of 0.002
+        assert found.right_accepted >= binom.ppf(0.002, 12, 0.99)  # of a false alarm of 0.01
 
 
-@pytest.mark.parametrize("setting", ["fixed", "wall", "unknown", "bearing"])
+@pytest.mark.parametrize(
+    "setting", ["wall", "bearing", *(pytest.param(name, marks=pytest.mark.soak) for name in ("fixed", "unknown"))]
+)
 def test_a_plate_that_fills_the_view_may_be_its_front_or_its_back(thin_bank, setting):
     # at 0.6 m the 16 × 16 camera sees nothing of the bracket but its plate, from behind as from the front
     bank = thin_bank("bracket", "pmd-16x16")
@@ -102,25 +105,29 @@ def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_f
     assert right[matches.accepted].all()
 
 
-def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path):
+@pytest.mark.parametrize("n", [8, pytest.param(30, marks=pytest.mark.soak)])
+def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path, n):
     # a column that the frame's front enters by little stopped counting, the view slid until the column was
     # contradicted, and the back remained alone
-    bank = bank_of("frame", "pmd-16x16", tmp_path, distance="0.45:1.25:0.01")
-    assert count(bank, "bearing", 30, 1, np.random.default_rng([11, 5])).wrong_accepted == 0
+    bank = bank_of("frame", "pmd-16x16", tmp_path, distance="0.45:1.25:0.02")
+    assert count(bank, "bearing", n, 1, np.random.default_rng([11, 5])).wrong_accepted == 0
 
 
 @pytest.mark.soak
 def test_only_the_final_covariance_excuses_pixels_that_a_view_contradicts(thin_bank):
     # another face ended two columns before the one that was seen, and its first covariance, far too wide, excused both
-    found = count(thin_bank("bracket", "pmd-16x16"), "bearing", 100, 10, np.random.default_rng([7, 10]))
+    found = count(thin_bank("bracket", "pmd-16x16", FINE), "bearing", 100, 10, np.random.default_rng([7, 10]))
     assert found.wrong_accepted == 0
 
 
-def test_a_lost_view_is_looked_for_at_its_best_distance(thin_bank):
+@pytest.mark.parametrize("n", [25, pytest.param(100, marks=pytest.mark.soak)])
+def test_a_lost_view_is_looked_for_at_its_best_distance(thin_bank, n):
     # around the scout's view, at its own distance, all angles led to one side minimum, and the back was accepted
-    found = count(thin_bank("frame", "vl53l5cx-8x8"), "plain", 100, 1, np.random.default_rng([5, 1]))
+    found = count(thin_bank("frame", "vl53l5cx-8x8"), "plain", n, 1, np.random.default_rng([5, 1]))
     assert found.wrong_accepted == 0
-    assert found.right >= 94
+    assert found.right >= 0.94 * n
+    # front and back of a thin frame with a window off its middle by 3 cm differ by less than a zone
+    assert "ambiguous" in {match.reason for match in found.answers}
 
 
 def test_the_nearest_image_is_ambiguous_where_another_one_explains_a_frame_as_well(thin_bank):
@@ -136,13 +143,6 @@ def test_a_bearing_that_nothing_tells_is_undetermined(thin_bank):
     found = count(thin_bank("panel", "pmd-16x16"), "bearing", 8, 10, np.random.default_rng(6))
     assert found.wrong_accepted == 0
     assert sum(match.reason == "undetermined" for match in found.answers) >= 5  # a few views show an edge
-
-
-def test_two_sides_that_look_alike_are_ambiguous(thin_bank):
-    # front and back of a thin frame with a window off its middle by 3 cm differ by less than a zone
-    found = count(thin_bank("frame", "vl53l5cx-8x8"), "bearing", 12, 1, np.random.default_rng(7))
-    assert found.wrong_accepted == 0
-    assert "ambiguous" in {match.reason for match in found.answers}
 
 
 def test_a_background_that_no_pixel_sees_alone_is_found_behind_the_panel(panel):
@@ -252,6 +252,6 @@ def test_a_wall_is_estimated_behind_a_landmark_beside_the_middle(free):
 @pytest.mark.parametrize("sensor", PRESETS)
 @pytest.mark.parametrize("name", meshes())
 def test_no_accepted_answer_on_thin_landmarks_is_grossly_wrong(thin_bank, name, sensor, setting, n_frames):
-    found = count(thin_bank(name, sensor), setting, 100, n_frames, np.random.default_rng([len(name), n_frames]))
+    found = count(thin_bank(name, sensor, FINE), setting, 100, n_frames, np.random.default_rng([len(name), n_frames]))
     print(f"{name} {sensor} {setting} {n_frames}: {found.right_accepted} of {found.right} right answers accepted")
     assert found.wrong_accepted == 0

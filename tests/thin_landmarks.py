@@ -26,6 +26,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "bearing": {"free": (*FIXED, "bearing_rad")},
     "nearest": {"method": "nearest"},
 }
+FINE, COARSE = "0.35:1.5:0.01", "0.35:1.31:0.02"
 GROSS_M, GROSS_RAD = 0.03, math.radians(6.0)
 
 
@@ -63,11 +64,11 @@ class Counts:
     answers: tuple[Match, ...] = ()
 
 
-def bank_of(name: str, sensor: str, folder: Path, distance: str = "0.35:1.5:0.01") -> Bank:
+def bank_of(name: str, sensor: str, folder: Path, distance: str = FINE) -> Bank:
     """Build the bank of a thin landmark from its file, as a user does."""
     mesh, symmetry = meshes()[name]
     mesh.export(folder / f"{name}.stl")
-    path = folder / f"{name}-{sensor}.h5"
+    path = folder / f"{name}-{sensor}-{distance.replace(':', '-')}.h5"
     arguments = ["bank", "build", "--mesh", f"{name}={folder / name}.stl", "--unit", "m", "--origin", "center"]
     grid = ["--distance", distance, "--delta", f"0:{360 // symmetry}:2", "--symmetry", str(symmetry)]
     assert main([*arguments, *grid, "--sensor", sensor, "--out", str(path)]) == 0
