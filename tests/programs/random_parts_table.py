@@ -119,7 +119,9 @@ class Counts:
         )
 
 
-def bank_of(seed: tuple[int, ...], per_bank: int, sensor: str, workers: int = 1) -> Bank:
+def bank_of(
+    seed: tuple[int, ...], per_bank: int, sensor: str, workers: int = 1, distance_m: str = "0.6:1.5:0.02"
+) -> Bank:
     """Build the bank of some random parts; a class is named by its number and its kind."""
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory(prefix="random-parts-") as folder:
@@ -129,9 +131,7 @@ def bank_of(seed: tuple[int, ...], per_bank: int, sensor: str, workers: int = 1)
             path = Path(folder) / f"{k}.ply"
             path.write_bytes(export_mesh(random_part(kind, rng), "ply"))
             plans.append(MeshPlan(name=f"{k}-{kind}", path=str(path), unit="m"))
-        plan = BankPlan(
-            meshes=tuple(plans), sensor=sensor, distance_m="0.6:1.5:0.02", delta_deg="0:360:2", layout="full"
-        )
+        plan = BankPlan(meshes=tuple(plans), sensor=sensor, distance_m=distance_m, delta_deg="0:360:2", layout="full")
         return build_bank(plan, workers=workers)
 
 
