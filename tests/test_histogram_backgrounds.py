@@ -40,8 +40,8 @@ CROWD = bank_of(CROWDED, classes=("cone",)).camera
 @pytest.mark.parametrize(
     ("n", "seed", "behind", "stated"),
     [
-        (24, 1, WALL, WALL),
-        (12, 3, FAINT, "auto"),
+        (12, 1, WALL, WALL),
+        (6, 3, FAINT, "auto"),
         pytest.param(1500, 2, WALL, WALL, marks=pytest.mark.soak),
         pytest.param(1000, 4, FAINT, "auto", marks=pytest.mark.soak),
     ],
@@ -54,44 +54,44 @@ def test_before_a_wall_known_or_estimated_error_is_at_the_bound_and_the_covarian
 
 def test_before_a_wall_on_a_floor_both_albedos_may_be_others_than_stated() -> None:
     true = Background(wall_m=1.6, floor_m=0.3, wall_albedo=0.35, floor_albedo=0.7)
-    check_bound(trials(30, 5, true, Background(wall_m=1.6, floor_m=0.3), classes=("cone",), known=("cone", "sphere")))
+    check_bound(trials(12, 5, true, Background(wall_m=1.6, floor_m=0.3), classes=("cone",), known=("cone", "sphere")))
 
 
 def test_pile_up_and_zones_that_overlap_leave_the_bound_as_it_is() -> None:
     first = renderer_of("cone", CROWD).expected(Views.broadcast(1.1), background=WALL).sum(axis=-1).max()
     assert first > 0.4 * CROWD.histogram.cycles  # many cycles end with their first photon
-    check_bound(trials(40, 6, WALL, WALL, CROWDED, ("cone",), ("cone", "sphere")))
+    check_bound(trials(16, 6, WALL, WALL, CROWDED, ("cone",), ("cone", "sphere")))
 
 
 def test_a_wall_that_is_not_stated_or_stands_elsewhere_is_refused() -> None:
     rng = np.random.default_rng(7)
     for off in (0.02, 0.05, 0.1, -0.02, -0.05):
         moved = Background(wall_m=1.6 + off)
-        views = random_views(10, rng)
+        views = random_views(3, rng)
         found = matcher_of(WALL).match(frames_of("cone", views, rng, behind=moved))
         assert set(found.reason) == {"poor fit"}, off
-    found = matcher_of(None).match(frames_of("cone", random_views(20, rng), rng, behind=WALL))
+    found = matcher_of(None).match(frames_of("cone", random_views(8, rng), rng, behind=WALL))
     assert not found.accepted.any()
 
 
 @pytest.mark.parametrize("stated", [WALL, "auto"])
 def test_a_bare_wall_is_no_landmark(stated: Stated) -> None:
     rng = np.random.default_rng(8)
-    found = matcher_of(stated).match(frames_of(None, random_views(12, rng), rng, behind=WALL))
+    found = matcher_of(stated).match(frames_of(None, random_views(3, rng), rng, behind=WALL))
     assert all(name is None for name in found.class_name)
     assert (found.class_probability["none"] > 0.9).all()
 
 
 def test_a_landmark_that_stands_alone_is_found_by_who_expects_a_wall() -> None:
     rng = np.random.default_rng(9)
-    views = random_views(8, rng)
+    views = random_views(4, rng)
     found = matcher_of("auto").match(frames_of("cone", views, rng))
     right = np.abs(view_errors(found, views, FREE, np.pi)) < [0.01, math.radians(6)]
     assert right[found.accepted].all()
-    assert found.accepted.sum() >= 7
+    assert found.accepted.sum() >= 3
 
 
-@pytest.mark.parametrize("each", [5, pytest.param(20, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("each", [2, pytest.param(20, marks=pytest.mark.soak)])
 def test_before_a_wall_targets_accept_nothing_wrong_and_refuse_another_wall(each: int) -> None:
     rng, squares, n_right = np.random.default_rng(10), [], 0
     matcher = matcher_of(WALL, "targets")
@@ -102,7 +102,7 @@ def test_before_a_wall_targets_accept_nothing_wrong_and_refuse_another_wall(each
         squares.append(nees(view_errors(found, views, FREE, np.pi)[found.accepted], found.covariance[found.accepted]))
     assert n_right >= binom.ppf(1e-4, 2 * each, 0.8)  # 254 of 300 were
     assert (np.concatenate(squares) < chi2.isf(1e-3, len(FREE))).all()
-    few = random_views(max(each // 3, 2), rng)
+    few = random_views(max(each // 3, 1), rng)
     assert not matcher.match(frames_of("cone", few, rng, behind=Background(wall_m=1.65))).accepted.any()
     bare = matcher.match(frames_of(None, few, rng, behind=WALL))
     assert all(name is None for name in bare.class_name)
