@@ -61,7 +61,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     seen = zone_transients(plane_samples(distances, footprint_grid(sensor)), sensor, axis)
     drawn = capture_histograms(expected_counts(seen, sensor, axis, 0.8), sensor, rng=rng)
     write_log(folder / "plane.npz", drawn.counts, sensor, distance_m=distances)
-    poses = poses_around(16, seed=3)
+    poses = poses_around(6, seed=3)
     samples = SceneMesh(block_on_table()).samples(world2cam(poses), footprint_grid(sensor))
     seen = zone_transients(samples, sensor, axis)
     drawn = capture_histograms(expected_counts(seen, sensor, axis, (0.5, 0.8)), sensor, rng=rng)

@@ -65,7 +65,7 @@ def judge(n: int, seed: int) -> tuple[np.ndarray, float]:
 
 
 def test_error_is_at_the_bound_and_the_covariance_is_honest() -> None:
-    n, sides = 100, norm.isf(0.0005 / 4)
+    n, sides = 30, norm.isf(0.0005 / 4)
     ratio, mean_nees = judge(n, seed=41)
     assert (np.abs(ratio - 1) < sides / np.sqrt(2 * n) + 0.02).all()  # 0.02: second order in the noise
     assert abs(mean_nees - 1) < sides * np.sqrt(2 / (n * len(FREE))) + 0.03

@@ -234,7 +234,9 @@ def test_commands_that_write_several_files_leave_those_of_somebody_else(tmp_path
 
 
 def test_a_command_that_writes_several_files_replaces_its_own_one_run_at_a_time(tmp_path, capsys):
-    out = ["sensor", "characterise", "vl53l5cx-8x8", "--frames", "50", "--out", str(tmp_path / "out")]
+    limits = "[sampling]\ndistances = 2\ndelta_step_deg = 15\n[search]\nboxes = 8\nuppers = 8\nstep_mm = 5\n"
+    (tmp_path / "plan.toml").write_text(f"n_classes = 1\nsymmetry = 4\n{limits}")
+    out = ["landmark", "design", str(tmp_path / "plan.toml"), "--confirm", "0", "--out", str(tmp_path / "out")]
     assert main(out) == 0
     (tmp_path / "out" / "notes.txt").write_text("mine")
     assert main(out) == 4

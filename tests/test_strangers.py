@@ -41,15 +41,15 @@ def test_copies_have_the_volume_of_their_size_and_of_what_is_left():
 def test_what_differs_more_is_accepted_less(bank_file):
     with open_bank(bank_file) as bank:
         matcher = Matcher(bank, "refine", free=("distance_m", "delta_rad"))
-        rates = {rate.change: rate for rate in stranger_rates(matcher, 10, n_frames=10)}
+        rates = {rate.change: rate for rate in stranger_rates(matcher, 5, n_frames=10)}
         for n, message in ((0, "must be at least 1, got 0"), (10**18, "made in memory: at most 39062 together")):
             with pytest.raises(UsageError, match=message):
                 stranger_rates(matcher, n)
-    assert {rate.frames for rate in rates.values()} == {10}
-    assert rates["size 0.8"].accepted + rates["size 1.25"].accepted <= 2
+    assert {rate.frames for rate in rates.values()} == {5}
+    assert rates["size 0.8"].accepted + rates["size 1.25"].accepted <= 1
     assert rates["size 0.95"].accepted > rates["size 0.8"].accepted
     for rate in rates.values():
-        assert rate.share.low <= rate.accepted / 10 <= rate.share.high
+        assert rate.share.low <= rate.accepted / 5 <= rate.share.high
 
 
 def test_the_command_prints_each_part(bank_file, capsys, monkeypatch):

@@ -471,12 +471,13 @@ def _unpacked(content: bytes) -> list[list[bytes]]:
 
 
 def main(kinds: str, count: str, seed: str, folder: str) -> int:
-    """Read mutants of each kind in a fork of this process, and print a line each; return 1 if a reader crashed."""
+    """Read mutants of each KIND or KIND:COUNT in a fork of this process, a line each; return 1 if a reader crashed."""
     codes: list[int] = []
-    for kind in kinds.split(","):
+    for one in kinds.split(","):
+        kind, _, own_count = one.partition(":")
         child = os.fork()
         if child == 0:
-            print(json.dumps(fuzz(kind, int(count), int(seed), Path(folder))), flush=True)
+            print(json.dumps(fuzz(kind, int(own_count or count), int(seed), Path(folder))), flush=True)
             os._exit(0)
         codes.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
         if codes[-1]:
