@@ -128,17 +128,17 @@ def test_views_in_the_last_cells_of_the_grid_are_found(matcher_of, renderers, di
 
 
 def test_the_error_of_distance_and_angle_is_the_bound_and_the_covariance_says_so(matcher_of, renderers):
-    # N = 500 over the four classes; 99.9 % intervals over 7 figures
+    # N = 240 over the four classes; 99.9 % intervals over 7 figures
     rng = np.random.default_rng(20)
     match = matcher_of(free=VIEW[:2]).match
-    errors = [run_trials(match, renderers[name], name, TrialSetup(), 125, rng) for name in NAMES]
+    errors = [run_trials(match, renderers[name], name, TrialSetup(), 60, rng) for name in NAMES]
     for trials in errors:
         assert (trials.found == trials.class_name).all()
     assert Trials.joined(errors).summary().class_errors.value == 0
     scaled = np.concatenate([t.scaled[~t.outlier] for t in errors])
     summaries = [t.summary() for t in errors]
     n = len(scaled)
-    assert n >= 494  # outliers are 0.3 % of all: more than 6 of 500 have a probability of 1e-3
+    assert n >= 236  # outliers are 0.3 % of all: more than 4 of 240 have a probability of 1e-3
     z = 3.7  # 99.9 % over 7 figures
     for k in range(2):
         ratio = math.sqrt((scaled[:, k] ** 2).mean())
@@ -283,7 +283,7 @@ def test_an_automatic_background_finds_the_wall_and_the_view_before_it(matcher_o
         assert match.delta_rad == pytest.approx(delta, abs=math.radians(0.3))
 
 
-@pytest.mark.parametrize("names", [("cone", "post"), pytest.param(("cylinder", "sphere"), marks=pytest.mark.soak)])
+@pytest.mark.parametrize("names", [("cone",), pytest.param(("cylinder", "sphere", "post"), marks=pytest.mark.soak)])
 @pytest.mark.parametrize("wall_m", [None, 2.2])
 def test_what_stands_behind_is_found_and_then_costs_few_views_more(matcher_of, renderers, wall_m, names):
     behind, rng = None if wall_m is None else Background(wall_m=wall_m), np.random.default_rng(8)
@@ -299,7 +299,7 @@ def test_what_stands_behind_is_found_and_then_costs_few_views_more(matcher_of, r
 
 @pytest.mark.parametrize("free", [VIEW[:2], pytest.param(VIEW[:3], marks=pytest.mark.soak)])
 def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(bank, renderers, free):
-    behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45), Background(wall_m=3.0)]
+    behind = [Background(wall_m=2.6), None, Background(wall_m=3.4, floor_m=0.45)]
     rng = np.random.default_rng(7)
     frames: list[FilteredFrames] = []
     for k, own in enumerate(behind):
@@ -318,7 +318,7 @@ def test_frames_before_several_backgrounds_are_matched_together_as_one_by_one(ba
         assert match.delta_rad == pytest.approx(expected.delta_rad, abs=1e-5)
         assert match.chi2 == pytest.approx(expected.chi2, rel=1e-6)
         assert (match.background is None) == (expected.background is None)
-    assert sum(match.accepted for match in together) >= 3
+    assert sum(match.accepted for match in together) >= 2
 
 
 def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank, renderers):
@@ -377,7 +377,7 @@ def test_a_wall_that_leaves_no_room_for_a_landmark_is_not_taken(bank, renderers,
 
 
 @pytest.mark.parametrize(
-    ("name", "n"), [("cone", 8), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
+    ("name", "n"), [("cone", 5), *(pytest.param(name, 300, marks=pytest.mark.soak) for name in NAMES[:3])]
 )
 def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(matcher_of, renderers, name, n):
     """A floor that cuts the landmark moves its lower edge; wall, floor and view share what the frame tells."""
