@@ -54,30 +54,30 @@ def test_before_a_wall_known_or_estimated_error_is_at_the_bound_and_the_covarian
 
 def test_before_a_wall_on_a_floor_both_albedos_may_be_others_than_stated() -> None:
     true = Background(wall_m=1.6, floor_m=0.3, wall_albedo=0.35, floor_albedo=0.7)
-    check_bound(trials(12, 5, true, Background(wall_m=1.6, floor_m=0.3), classes=("cone",), known=("cone", "sphere")))
+    check_bound(trials(8, 5, true, Background(wall_m=1.6, floor_m=0.3), classes=("cone",), known=("cone", "sphere")))
 
 
 def test_pile_up_and_zones_that_overlap_leave_the_bound_as_it_is() -> None:
     first = renderer_of("cone", CROWD).expected(Views.broadcast(1.1), background=WALL).sum(axis=-1).max()
     assert first > 0.4 * CROWD.histogram.cycles  # many cycles end with their first photon
-    check_bound(trials(16, 6, WALL, WALL, CROWDED, ("cone",), ("cone", "sphere")))
+    check_bound(trials(12, 6, WALL, WALL, CROWDED, ("cone",), ("cone", "sphere")))
 
 
 def test_a_wall_that_is_not_stated_or_stands_elsewhere_is_refused() -> None:
     rng = np.random.default_rng(7)
     for off in (0.02, 0.05, 0.1, -0.02, -0.05):
         moved = Background(wall_m=1.6 + off)
-        views = random_views(3, rng)
+        views = random_views(2, rng)
         found = matcher_of(WALL).match(frames_of("cone", views, rng, behind=moved))
         assert set(found.reason) == {"poor fit"}, off
-    found = matcher_of(None).match(frames_of("cone", random_views(8, rng), rng, behind=WALL))
+    found = matcher_of(None).match(frames_of("cone", random_views(4, rng), rng, behind=WALL))
     assert not found.accepted.any()
 
 
 @pytest.mark.parametrize("stated", [WALL, "auto"])
 def test_a_bare_wall_is_no_landmark(stated: Stated) -> None:
     rng = np.random.default_rng(8)
-    found = matcher_of(stated).match(frames_of(None, random_views(3, rng), rng, behind=WALL))
+    found = matcher_of(stated).match(frames_of(None, random_views(2, rng), rng, behind=WALL))
     assert all(name is None for name in found.class_name)
     assert (found.class_probability["none"] > 0.9).all()
 

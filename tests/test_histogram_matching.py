@@ -120,7 +120,7 @@ def test_gradient_and_information_are_those_of_the_piled_up_likelihood() -> None
 
 
 def test_error_is_at_the_poisson_bound_and_the_covariance_is_honest() -> None:
-    check_bound(trials(150, seed=3), slack=0.02)
+    check_bound(trials(60, seed=3), slack=0.02)
 
 
 @pytest.mark.soak
@@ -148,13 +148,13 @@ def test_brightness_and_ambient_light_that_the_sensor_file_does_not_know_cost_no
 
 def test_the_bearing_is_estimated_unless_the_matcher_is_told_and_lies_within_its_errors() -> None:
     rng = np.random.default_rng(7)
-    views = Views.broadcast(1.1, rng.uniform(0, np.pi, 9), np.radians(rng.normal(0, 1.5, 9)))
+    views = Views.broadcast(1.1, rng.uniform(0, np.pi, 5), np.radians(rng.normal(0, 1.5, 5)))
     found = matcher_of(free=None).match(frames_of("cylinder", views, rng))
     assert found.free == ("distance_m", "delta_rad", "bearing_rad")
     error = view_errors(found, views, found.free, np.pi)
-    assert (found.class_name == "cylinder").sum() >= 8
+    assert (found.class_name == "cylinder").sum() >= 4
     assert (np.abs(error) < 5 * np.sqrt(np.einsum("npp->np", found.covariance))).all()
-    assert found.accepted.sum() >= 6
+    assert found.accepted.sum() >= 3
 
 
 def test_height_and_pitch_are_estimated_on_request_and_a_wrong_hill_is_refused() -> None:
@@ -173,7 +173,7 @@ def test_height_and_pitch_are_estimated_on_request_and_a_wrong_hill_is_refused()
 def test_nothing_a_wall_and_another_thing_are_not_accepted() -> None:
     rng = np.random.default_rng(9)
     sensor = bank_of().camera
-    empty = np.tile(detected_counts(np.zeros((1, 64, sensor.histogram.bins)), sensor), (20, 1, 1))
+    empty = np.tile(detected_counts(np.zeros((1, 64, sensor.histogram.bins)), sensor), (6, 1, 1))
     nothing = matcher_of().match(capture_histograms(empty, sensor, rng=rng))
     assert all(name is None for name in nothing.class_name)
     assert not nothing.accepted.any()
@@ -210,16 +210,16 @@ def declaring(frames: HistogramFrames, time_s: np.ndarray | None = None, **decla
     return HistogramFrames(frames.counts, sensor=frames.sensor.with_(**declared), time_s=time_s)
 
 
-@pytest.mark.parametrize("on", ["histograms", "targets"])
+@pytest.mark.parametrize("on", ["histograms", pytest.param("targets", marks=pytest.mark.soak)])
 def test_what_a_sensor_declares_is_in_the_covariance_that_acceptance_reads(on: Measured) -> None:
-    frames = frames_of("cone", Views.broadcast([1.05, 1.12], [0.4, 0.9]), np.random.default_rng(15), n_frames=4)
+    frames = frames_of("cone", Views.broadcast(1.12, 0.9), np.random.default_rng(15), n_frames=4)
     plain, matcher = matcher_of(on=on).match(frames), matcher_of(on=on)
     assert plain.accepted.all()
     little = matcher.match(declaring(frames, systematic_distance_m=0.004))
     assert little.accepted.all()
-    np.testing.assert_allclose(little.covariance - plain.covariance, [np.diag([0.004**2, 0.0])] * 2, atol=1e-12)
+    np.testing.assert_allclose(little.covariance - plain.covariance, [np.diag([0.004**2, 0.0])], atol=1e-12)
     much = matcher.match(declaring(frames, systematic_distance_m=0.02))  # 3 σ is 6 cm, twice the tolerance
-    assert [match.reason for match in much] == ["undetermined"] * 2
+    assert [match.reason for match in much] == ["undetermined"]
     unasked = Matcher(bank_of(), "refine", free=FREE, on=on, systematic=("motion",), workers=1)
     assert unasked.match(declaring(frames, systematic_distance_m=0.02)).accepted.all()
 
@@ -287,8 +287,8 @@ def targets_over_covariance(n: int, seed: int) -> np.ndarray:
 
 
 def test_targets_give_class_and_view_within_their_errors() -> None:
-    squares = targets_over_covariance(24, seed=12)
-    assert len(squares) >= binom.ppf(1e-4, 24, 0.95)
+    squares = targets_over_covariance(12, seed=12)
+    assert len(squares) >= binom.ppf(1e-4, 12, 0.95)
     # sums of squares of standard normal numbers are χ²; 0.2: sigmas are estimates, and costs no parabolas
     low, high = chi2.ppf([0.00025, 0.99975], 2 * len(squares)) / (2 * len(squares))
     assert low - 0.2 < squares.mean() / 2 < high + 0.2
@@ -396,6 +396,6 @@ def test_what_does_not_go_with_histograms_is_refused_in_one_line() -> None:
 
 def test_the_table_states_its_size_before_it_is_made() -> None:
     for background in (None, Background(wall_m=1.6)):
-        direct = matcher_of(background)._direct
+        direct = matcher_of(background, classes=("cone",))._direct
         assert isinstance(direct, HistogramMatcher)
         assert direct.table_bytes == sum(table.n_bytes for table in direct.tables)
