@@ -70,7 +70,8 @@ def test_mirroring_first_and_turning_then_is_undone_by_the_inverse(orientation):
     assert len({str(one.apply(image)) for one in ORIENTATIONS}) == 8
 
 
-@pytest.mark.parametrize(("name", "seed"), [("handed", 1), pytest.param("stone", 0, marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize(("name", "seed"), [("handed", 1), ("stone", 0)])
 def test_the_orientation_of_a_part_without_symmetry_is_learnt(banks, name, seed, monkeypatch):
     match, matched = Matcher.match, []
     monkeypatch.setattr(Matcher, "match", lambda self, frames: matched.append(len(frames)) or match(self, frames))

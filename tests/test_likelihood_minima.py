@@ -185,8 +185,8 @@ def test_odds_of_two_classes_are_those_of_their_likelihoods_integrated_over_all_
     """Single exposures hardly tell a post from a prism with six sides."""
     meshes = {name: trimesh.creation.cylinder(0.09, 0.3, sections=sides) for name, sides in SIDES.items()}
     rng, off, n = np.random.default_rng(5), [], 20
-    distance = np.linspace(0.9, 1.1, 201)
-    turns = [np.zeros(1), np.radians(np.arange(0, 60, 0.5))]  # a post has one view, and a prism those of its period
+    distance = np.linspace(0.9, 1.1, 101)
+    turns = [np.zeros(1), np.radians(np.arange(0, 60, 1.0))]  # a post has one view, and a prism those of its period
     with bank_of(tmp_path, meshes, "0.9:1.1:0.01", "0:359:1") as bank:
         matcher = Matcher(bank, "refine", free=FIXED)
         for name in SIDES:

@@ -24,7 +24,9 @@ def shell(command: str, folder: Path, **environment: str) -> subprocess.Complete
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+@pytest.mark.parametrize(
+    "closed", [">&- 2>&- <&-", *(pytest.param(one, marks=pytest.mark.soak) for one in (">&-", "2>&-", "<&-"))]
+)
 def test_a_closed_stream_changes_neither_the_files_nor_the_exit_code(closed: str, tmp_path: Path) -> None:
     done = shell(closed, tmp_path)
     assert (done.returncode, done.stderr) == (0, "")

@@ -19,7 +19,7 @@ from phasemark.matcher.nearest.bank_minima import Upward
 from phasemark.render import Background, Renderer, Views, capture, preset
 
 PMD = preset("pmd-16x16")
-PLAN = BankPlan(classes=["cylinder", "cone"], distance_m="0.85:1.3:0.02", delta_deg="0:180:2")
+PLAN = BankPlan(classes=["cylinder", "cone"], distance_m="0.85:1.25:0.02", delta_deg="0:180:2")
 UNKNOWN: dict[str, Any] = {"pitch_std_rad": math.inf, "roll_std_rad": math.inf}
 ANYWHERE = TrialSetup(
     free=VIEW, distance_m=(0.95, 1.15), bearing_rad=0.04, height_m=0.04, pitch_rad=0.05, roll_rad=0.1, n_frames=2000
@@ -119,7 +119,7 @@ def test_before_a_wall_heights_and_pitches_that_cancel_are_not_said_to_be_known(
 @pytest.mark.parametrize("albedo", [0.56, pytest.param(0.8, marks=pytest.mark.soak)])
 def test_phasors_before_a_wall_are_at_the_bound_with_a_free_tilt_and_albedo(bank, albedo):
     """What the wall returns moves through the image with bearing, pitch and roll, and has a brightness of its own."""
-    wall, n = Background(wall_m=3.0), 6
+    wall, n = Background(wall_m=3.0), 5
     free = (*VIEW[:3], "pitch_rad", "roll_rad")
     rng = np.random.default_rng(5)
     tilts = [rng.normal(0, width, n) for width in (0.03, 0.04, 0.06)]
@@ -135,15 +135,15 @@ def test_phasors_before_a_wall_are_at_the_bound_with_a_free_tilt_and_albedo(bank
     at_bound = np.einsum("ni,nij,nj->n", error, np.linalg.inv(bound), error)
     own = np.einsum("ni,nij,nj->n", error, np.linalg.inv(matches.covariance), error)
     # medians: bounds and covariances are local beside the edges of a landmark before a wall (PHYSICS section 7); the
-    # median of n values of a χ² of 5 lies below 2.35 of its own in 99.9 % of samples of 6
+    # median of n values of a χ² of 5 lies below 2.75 of its own in 99.9 % of samples of 5
     for squares in (at_bound, own):
-        assert np.median(squares) < 2.35 * stats.chi2.median(len(free))
+        assert np.median(squares) < 2.75 * stats.chi2.median(len(free))
     assert own.max() < 60
 
 
 def test_what_a_frame_cannot_tell_is_refused_unless_it_is_known_before(bank, renderers):
     # a single frame: height and pitch trade, a centimetre for half a degree
-    views = Views.broadcast(1.2, [0.3, 2.2], 0.0, 0.01, 0.02, -0.05)
+    views = Views.broadcast(1.2, 2.2, 0.0, 0.01, 0.02, -0.05)
     frames = frames_of(renderers["cylinder"], views, n_frames=1)
     alone = Matcher(bank, "refine", free=VIEW, **UNKNOWN).match(frames)
     assert not alone.accepted.any()
