@@ -134,7 +134,10 @@ def test_a_landmark_outside_the_bank_is_found_at_its_distance(banks, distance_m)
     assert found.changes[0].value == pytest.approx(distance_m, abs=3e-3)  # five standard deviations
 
 
-@pytest.mark.parametrize(("parameter", "value"), [("pitch_rad", -0.052), ("roll_rad", 0.07), ("height_m", 0.03)])
+@pytest.mark.parametrize(
+    ("parameter", "value"),
+    [("pitch_rad", -0.052), ("height_m", 0.03), pytest.param("roll_rad", 0.07, marks=pytest.mark.soak)],
+)
 def test_a_tilted_or_lifted_camera_is_diagnosed_with_what_was_not_free(banks, parameter, value):
     view = {"height_m": 0.0, "pitch_rad": 0.0, "roll_rad": 0.0, parameter: value}
     found = diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", *CONE_VIEW, 0.0, *view.values()))

@@ -417,8 +417,13 @@ def test_a_stranger_on_the_same_box_is_refused(matcher_of, name, free, n):
     assert (matches.class_probability["none"][far] > 0.99).all()
 
 
-@pytest.mark.parametrize("background", [None, "auto", "known"])
-@pytest.mark.parametrize("scene", ["wall", "empty"])
+@pytest.mark.parametrize(
+    ("scene", "background"),
+    [
+        *(("empty", background) for background in (None, "auto", "known")), ("wall", "auto"), ("wall", "known"),
+        pytest.param("wall", None, marks=pytest.mark.soak),
+    ],
+)  # fmt: skip
 def test_a_scene_without_a_landmark_is_none(bank_of_two, background, scene):
     behind = Background(wall_m=3.0) if scene == "wall" else None
     image = Renderer(None, SENSOR).render(1.0, background=behind)
