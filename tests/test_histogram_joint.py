@@ -140,7 +140,9 @@ def test_a_frame_that_contradicts_the_others_is_refused() -> None:
 def test_the_bearing_is_estimated_and_walls_are_where_asked() -> None:
     rng = np.random.default_rng(6)
     view = Views.broadcast(1.1, 0.7, 0.02)
-    found = matcher_of(free=(*FREE, "bearing_rad")).match_jointly(frames_of_poses(("cone",) * 2, view, rng), POSES[:2])
+    found = matcher_of(free=(*FREE, "bearing_rad"), classes=("cone",)).match_jointly(
+        frames_of_poses(("cone",) * 2, view, rng), POSES[:2]
+    )
     assert found.accepted
     assert abs(found.bearing_rad - 0.02) < 5 * math.sqrt(found.covariance[2, 2])
     seen = views_from(relative_poses(2, POSES[:2])[1], Views.broadcast(1.1, 0.7))
@@ -149,7 +151,7 @@ def test_the_bearing_is_estimated_and_walls_are_where_asked() -> None:
         for at, wall in ((Views.broadcast(1.1, 0.7), 1.8), (seen, 1.9))
     ]
     frames = capture_histograms(np.concatenate(means), bank_of().camera, rng=rng)
-    both = matcher_of("auto").match_jointly(frames, POSES[:2])
+    both = matcher_of("auto", classes=("cone",)).match_jointly(frames, POSES[:2])
     assert both.accepted
     assert abs(both.distance_m - 1.1) < 5 * math.sqrt(both.covariance[0, 0])
 
