@@ -43,15 +43,15 @@ def test_a_frame_is_matched_before_the_first_background_that_explains_it(bank, f
     assert not found[0].among_unknown
     assert found[1].background.wall_m == pytest.approx(2.6, abs=0.01)
     assert [match.among_unknown for match in found] == [False, False, True]
-    alone = [Matcher(bank, "refine", free=FIXED, background=own).match(frames) for own in (None, "auto", "unknown")]
-    for k, matches in enumerate(alone):
-        assert matches[k].as_dict() == found[k].as_dict()
-        assert not any(alone[earlier][k].accepted for earlier in range(k))
+    for k, own in enumerate((None, "auto", "unknown")):
+        alone = Matcher(bank, "refine", free=FIXED, background=own).match(frames[k:])
+        assert alone[0].as_dict() == found[k].as_dict()
+        assert not alone.accepted[1:].any()
 
 
 @pytest.mark.parametrize("n_frames", [1, 50])
 def test_a_floor_in_view_before_and_beside_the_landmark_is_estimated_with_the_wall(bank, n_frames):
-    rng, n = np.random.default_rng(4), 6
+    rng, n = np.random.default_rng(4), 3
     distance_m, delta_rad = rng.uniform(0.92, 1.08, n), rng.uniform(0.0, math.pi, n)
     floor_m, wall_m = rng.uniform(0.16, 0.2, n), distance_m + rng.uniform(0.8, 2.0, n)
     renderer, accepted = Renderer(bank.mesh("cone"), SENSOR, albedo=0.8), 0
