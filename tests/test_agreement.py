@@ -105,7 +105,7 @@ def test_a_plate_is_not_taken_for_its_back_where_the_search_stopped_beside_its_f
     assert right[matches.accepted].all()
 
 
-@pytest.mark.parametrize("n", [8, pytest.param(30, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("n", [5, pytest.param(30, marks=pytest.mark.soak)])
 def test_pixels_that_are_counted_anew_do_not_let_a_view_slide_away(tmp_path, n):
     # a column that the frame's front enters by little stopped counting, the view slid until the column was
     # contradicted, and the back remained alone

@@ -118,7 +118,7 @@ def test_a_limit_leaves_out_the_cells_above_it_and_no_other(prisms):
 
 
 @pytest.mark.parametrize("sides", [5, pytest.param(6, marks=pytest.mark.soak)])
-@pytest.mark.parametrize("setting", ["fixed", "bearing", "wall"])
+@pytest.mark.parametrize("setting", [pytest.param("fixed", marks=pytest.mark.soak), "bearing", "wall"])
 def test_a_prism_is_never_accepted_a_face_off(prisms, sides, setting):
     bank, n = prisms[sides], 40 if sides == 6 else 16
     distance, delta, rng = drawn(n, sides) if sides == 6 else drawn(n, sides, 0.85, 1.15)

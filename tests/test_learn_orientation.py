@@ -85,7 +85,7 @@ def test_the_orientation_of_a_part_without_symmetry_is_learnt(banks, name, seed,
 
 def test_a_symmetric_box_leaves_the_mirrored_orientation_open(banks):
     true, box = Orientation(rotate=90), banks("box")
-    learnt = learn_orientation(Matcher(box, "refine", free=VIEW), recording(box, true, 3))
+    learnt = learn_orientation(Matcher(box, "refine", free=VIEW), recording(box, true, 3, 2))
     assert {true, Orientation(True, 270)} <= set(learnt.left)
     with pytest.raises(UsageError, match="by a Matcher of the method 'refine'"):
         learn_orientation(Matcher(box), recording(box, true, 3, 2))

@@ -33,7 +33,7 @@ def small_parts(monkeypatch, n_bytes):
     ("options", "share"),
     [
         # cells of twice the grid's step in D, 9 bytes a pixel, and some parts: 0.6 of the images; intervals in float64
-        ({"method": "refine", "free": VIEW}, 1.7),
+        pytest.param({"method": "refine", "free": VIEW}, 1.7, marks=pytest.mark.soak),
         ({"method": "refine"}, 2.2),
         pytest.param({"method": "refine", "free": (*VIEW, "bearing_rad")}, 2.2, marks=pytest.mark.soak),
         # ranges in float64 while their mean is not known, then in float32, and what may and must return
@@ -67,7 +67,9 @@ def test_templates_do_not_depend_on_how_many_images_are_read_together(path, opti
 
 
 @pytest.mark.parametrize(
-    "background", [None, WALL, pytest.param("auto", marks=pytest.mark.soak)], ids=["alone", "wall", "auto"]
+    "background",
+    [pytest.param(None, marks=pytest.mark.soak), WALL, pytest.param("auto", marks=pytest.mark.soak)],
+    ids=["alone", "wall", "auto"],
 )
 def test_answers_do_not_depend_on_how_many_images_are_read_together(path, background, monkeypatch):
     with open_bank(path) as bank:

@@ -50,7 +50,7 @@ def errors(matches, views, free):
     return error
 
 
-@pytest.mark.parametrize("name", ["cylinder", "cone"])
+@pytest.mark.parametrize("name", ["cone", pytest.param("cylinder", marks=pytest.mark.soak)])
 def test_all_six_numbers_are_at_the_bound_and_their_covariance_is_honest(bank, renderers, name):
     matcher = Matcher(bank, "refine", free=VIEW, **UNKNOWN)
     n = 12
@@ -68,14 +68,14 @@ def test_all_six_numbers_are_at_the_bound_and_their_covariance_is_honest(bank, r
 
 @pytest.mark.parametrize(
     "added",
-    [("height_m",), ("pitch_rad",), ("roll_rad",), ("bearing_rad", "pitch_rad"), ("height_m", "roll_rad")],
+    [("pitch_rad",), ("bearing_rad", "pitch_rad"), ("height_m", "roll_rad")],
     ids=" ".join,
 )
 def test_any_of_them_may_be_free(bank, renderers, added):
     free = tuple(name for name in VIEW if name in (*VIEW[:2], *added))
     rng = np.random.default_rng(8)
     spread = {"bearing_rad": 0.05, "height_m": 0.05, "pitch_rad": 0.06, "roll_rad": 0.15}
-    n = 8
+    n = 5
     moved = {name: rng.uniform(-1, 1, n) * spread[name] for name in added}
     views = Views.broadcast(rng.uniform(0.95, 1.15, n), rng.uniform(0, math.pi, n), **moved)
     matches = Matcher(bank, "refine", free=free, **UNKNOWN).match(frames_of(renderers["cone"], views))
@@ -88,7 +88,7 @@ def test_any_of_them_may_be_free(bank, renderers, added):
         np.testing.assert_array_equal(getattr(matches, name), 0.0)
 
 
-@pytest.mark.parametrize("elevation", [-0.09, -0.05, 0.06, 0.09])
+@pytest.mark.parametrize("elevation", [-0.09, 0.09])
 @pytest.mark.parametrize("by", ["height_m", "pitch_rad"])
 def test_a_landmark_is_found_rows_above_and_below_the_middle(bank, renderers, by, elevation):
     away = {"height_m": 1.05 * math.tan(elevation)} if by == "height_m" else {"pitch_rad": elevation}
@@ -162,7 +162,7 @@ def test_what_a_frame_cannot_tell_is_refused_unless_it_is_known_before(bank, ren
 
 
 def test_a_tilt_that_is_not_estimated_is_refused_rather_than_explained_by_another_view(bank, renderers):
-    rng, n = np.random.default_rng(6), 4
+    rng, n = np.random.default_rng(6), 2
     views = Views.broadcast(
         rng.uniform(0.9, 1.2, n), rng.uniform(0, math.pi, n), pitch_rad=0.07 * rng.choice([-1, 1], n), roll_rad=0.1
     )
