@@ -287,8 +287,8 @@ def targets_over_covariance(n: int, seed: int) -> np.ndarray:
 
 
 def test_targets_give_class_and_view_within_their_errors() -> None:
-    squares = targets_over_covariance(12, seed=12)
-    assert len(squares) >= binom.ppf(1e-4, 12, 0.95)
+    squares = targets_over_covariance(6, seed=12)
+    assert len(squares) >= binom.ppf(1e-4, 6, 0.95)
     # sums of squares of standard normal numbers are χ²; 0.2: sigmas are estimates, and costs no parabolas
     low, high = chi2.ppf([0.00025, 0.99975], 2 * len(squares)) / (2 * len(squares))
     assert low - 0.2 < squares.mean() / 2 < high + 0.2
