@@ -101,7 +101,9 @@ def test_a_zone_at_an_edge_reports_the_landmark_or_the_wall_and_nothing_between(
     assert ((z_m[:, between] < 0.8) | (np.abs(z_m[:, between] - wall_m) < 0.05)).all()
 
 
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize(
+    "scene", ["nothing behind", pytest.param("a wall", marks=pytest.mark.soak), "a wall near by and a floor"]
+)
 def test_frames_of_a_chip_are_matched_whatever_stands_behind(scene):
     name, view, background = view_of(*SCENES[scene])
     match = Matcher(bank(name), "refine", on="reported").match(kalman_filter(chip_frames(name, view, background)))[0]
