@@ -68,7 +68,12 @@ def test_all_six_numbers_are_at_the_bound_and_their_covariance_is_honest(bank, r
 
 @pytest.mark.parametrize(
     "added",
-    [("pitch_rad",), ("bearing_rad", "pitch_rad"), ("height_m", "roll_rad")],
+    [
+        ("pitch_rad",),
+        ("bearing_rad", "pitch_rad"),
+        ("height_m", "roll_rad"),
+        *(pytest.param(one, marks=pytest.mark.soak) for one in (("height_m",), ("roll_rad",))),
+    ],
     ids=" ".join,
 )
 def test_any_of_them_may_be_free(bank, renderers, added):
@@ -88,7 +93,9 @@ def test_any_of_them_may_be_free(bank, renderers, added):
         np.testing.assert_array_equal(getattr(matches, name), 0.0)
 
 
-@pytest.mark.parametrize("elevation", [-0.09, 0.09])
+@pytest.mark.parametrize(
+    "elevation", [-0.09, 0.09, *(pytest.param(one, marks=pytest.mark.soak) for one in (-0.05, 0.06))]
+)
 @pytest.mark.parametrize("by", ["height_m", "pitch_rad"])
 def test_a_landmark_is_found_rows_above_and_below_the_middle(bank, renderers, by, elevation):
     away = {"height_m": 1.05 * math.tan(elevation)} if by == "height_m" else {"pitch_rad": elevation}
@@ -135,9 +142,9 @@ def test_phasors_before_a_wall_are_at_the_bound_with_a_free_tilt_and_albedo(bank
     at_bound = np.einsum("ni,nij,nj->n", error, np.linalg.inv(bound), error)
     own = np.einsum("ni,nij,nj->n", error, np.linalg.inv(matches.covariance), error)
     # medians: bounds and covariances are local beside the edges of a landmark before a wall (PHYSICS section 7); the
-    # median of n values of a χ² of 5 lies below 2.75 of its own in 99.9 % of samples of 5
+    # median of n values of a χ² of 5 lies below 2.6 of its own in 99.9 % of samples of 5
     for squares in (at_bound, own):
-        assert np.median(squares) < 2.75 * stats.chi2.median(len(free))
+        assert np.median(squares) < 2.6 * stats.chi2.median(len(free))
     assert own.max() < 60
 
 
