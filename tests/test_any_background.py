@@ -1,6 +1,7 @@
 """``background="any"``: nothing, wall and floor, and unknown things are tried in turn, up to what explains a frame."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,8 @@ def test_a_frame_is_matched_before_the_first_background_that_explains_it(bank, f
     assert not found[0].among_unknown
     assert found[1].background.wall_m == pytest.approx(2.6, abs=0.01)
     assert [match.among_unknown for match in found] == [False, False, True]
-    for k, own in enumerate((None, "auto", "unknown")):
+    backgrounds: tuple[Any, ...] = (None, "auto", "unknown")
+    for k, own in enumerate(backgrounds):
         alone = Matcher(bank, "refine", free=FIXED, background=own).match(frames[k:])
         assert alone[0].as_dict() == found[k].as_dict()
         assert not alone.accepted[1:].any()
