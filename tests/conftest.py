@@ -26,8 +26,9 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 _LONGEST = {
     f"test_{name}.py"
     for name in (
-        "calibrate", "design", "direct_pose", "drive", "frequency_matching", "histogram_backgrounds", "histogram_joint",
-        "histogram_matching", "lens_calibration", "recordings", "refine", "region", "sweep_report",
+        "agreement", "calibrate", "cells", "diagnosis", "direct_fit", "drive", "frequency_matching",
+        "histogram_backgrounds", "histogram_matching", "lens_calibration", "recordings", "refine", "sweep_report",
+        "tilted_matching",
     )
 }  # fmt: skip
 """Files of tests that take longest. They go first: a worker that began one of them last would work alone."""

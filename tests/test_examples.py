@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from phasemark.cli import main
 
@@ -223,6 +224,66 @@ def test_too_short_a_recording_calibrates_nothing(tmp_path):
     assert code == 3
     assert err.splitlines()[-1].startswith("error: ")
     assert not (tmp_path / "out").exists()
+
+
+def command(*arguments):
+    """Run a command of phasemark in this process; return its exit code and what it wrote."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main([str(argument) for argument in arguments])
+    return code, out.getvalue(), err.getvalue()
+
+
+def test_two_recordings_calibrate_a_sensor_that_matches_a_third_within_its_ellipses(tmp_path):
+    """The steps of docs/recordings.md on the command line; the recordings differ by 4 mm and 1°."""
+    for k, (delay_s, offset_m, bearing_deg) in enumerate(((-0.08, -9e-3, 1.6), (0.05, -5e-3, 2.6), (0.02, -8e-3, 2.2))):
+        own = {"delay_s": delay_s, "offset_m": offset_m, "bearing_deg": bearing_deg, "floor": False}
+        write_recording(tmp_path / f"{k}.csv", np.random.default_rng([3, k]), n=60, **own)
+        code, _, err = run("split_recording", tmp_path / f"{k}.csv", "--out", tmp_path / str(k))
+        assert code == 0, err
+    for name, size in (("panel", (0.01, 0.61, 0.49)), ("wide", (0.01, 4.0, 4.0))):
+        trimesh.creation.box(size).export(tmp_path / f"{name}.stl")
+    mesh = ("bank", "build", "--unit", "m", "--origin", "center", "--symmetry", 2)
+    read = ("--valid-status", 5, "--quantity", "z", "--moving")
+    sensor = tmp_path / "mine.toml"
+    panel = ("--sensor", "vl53l5cx-8x8", "--distance", "0.5:0.9:0.2", "--delta", "0:180:30", "--out", tmp_path / "p.h5")
+    assert command(*mesh, "--mesh", f"panel={tmp_path / 'panel.stl'}", *panel)[0] == 0
+    whole = [tmp_path / k / "whole.csv" for k in "01"]
+    fixed = ("--landmark-xy", 0.005, 0, "--fix", "height", "--out", sensor)
+    calibrate = ("calibrate", tmp_path / "p.h5", *whole, *read, *fixed)
+    poses = [tmp_path / k / "whole_poses.csv" for k in "01"]
+    code, _, err = command(*calibrate, "--poses", poses[0])
+    assert code == 2
+    assert "got 2 recordings and 1 --poses" in err
+    code, out, err = command(*calibrate, "--poses", poses[0], "--poses", poses[1])
+    assert code == 0, err
+    assert "recordings, less what they share" in out
+    wide = ("--sensor", sensor, "--distance", "0.5:0.8:0.01", "--delta=-40:40:1", "--out", tmp_path / "wide.h5")
+    assert command(*mesh, "--mesh", f"panel={tmp_path / 'wide.stl'}", *wide)[0] == 0
+    third = (tmp_path / "wide.h5", tmp_path / "2" / "whole.csv", *read, "--fix", "bearing", "--unknown-background")
+    widths = []
+    for more in ((), ("--same-recording",)):
+        estimates = tmp_path / "est.csv"
+        code, _, err = command("match", *third, *more, "--force", "--estimates", estimates)
+        assert code == 0, err
+        code, out, err = run("score_recording", estimates, tmp_path / "2" / "whole_poses.csv")
+        assert code == 0, err
+        assert "accepted beyond 30 mm or 6°: 0 of" in out
+        widths.append(float(out.split("median standard deviation ")[1].split("\n")[0]))
+        if not more:
+            assert int(out.split("95 % ellipse: ")[1].split(" %")[0]) >= 85
+    assert widths[1] < widths[0]
+
+
+def test_tables_without_a_column_are_refused_by_its_name(tmp_path):
+    (tmp_path / "bare.csv").write_text("t_ms,mm_0\n1,2\n")
+    code, _, err = run("split_recording", tmp_path / "bare.csv", "--out", tmp_path / "out")
+    assert (code, err.count("\n")) == (3, 1)
+    assert "no column 'panel_x_m'" in err
+    assert not (tmp_path / "out").exists()
+    code, _, err = run("score_recording", tmp_path / "bare.csv", tmp_path / "bare.csv")
+    assert (code, err.count("\n")) == (3, 1)
+    assert "no column 'pose_time_s'" in err
 
 
 @pytest.mark.skipif("PHASEMARK_RECORDING" not in os.environ, reason="PHASEMARK_RECORDING names no recording")

@@ -12,7 +12,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter
 from phasemark.matcher.filters.filtered_frames import noise_free
-from phasemark.matcher.likelihood.systematic import calibrated_slopes, rates_of_views
+from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS, calibrated_slopes, rates_of_views
 from phasemark.matcher.statistics import within_ellipsoid
 from phasemark.render import Background, Frames, Renderer, Views, capture
 
@@ -117,6 +117,30 @@ def test_each_term_can_be_left_out_and_is_listed(bank):
         assert set(match.as_dict()["systematic"]) == set(terms)
     declared = by_terms["declared",].systematic["declared"]
     np.testing.assert_allclose(declared, np.diag([0.0, math.radians(0.5) ** 2]), rtol=1e-12)
+
+
+def test_another_recording_differs_as_a_calibration_of_that_covariance_would(bank):
+    stds = {"range_offset_m": 5e-3, "pitch_deg": 0.8, "roll_deg": 0.7, "bearing_offset_deg": 0.6}
+    own = dict(zip(RECORDING_FIELDS.values(), stds.values(), strict=True))
+    as_calibrated = bank.sensor.with_(
+        calibration_fields=tuple(stds), calibration_covariance=tuple(map(tuple, np.diag(np.square([*stds.values()]))))
+    )
+    views, sensor = Views.broadcast(1.0, 0.7), bank.sensor.with_(**own)
+    parts = [
+        Matcher(bank, "refine", free=VIEW, tolerance_m=0.5, tolerance_rad=1.0)
+        .match(noise_free(Renderer(bank.mesh("cone"), one, albedo=0.8).render(1.0, 0.7), 50))[0]
+        .systematic
+        for one in (sensor, as_calibrated)
+    ]
+    assert [set(part) for part in parts] == [{"recording"}, {"calibration"}]
+    np.testing.assert_allclose(parts[0]["recording"], parts[1]["calibration"], rtol=1e-9)
+    renderer = Renderer(bank.mesh("cone"), sensor, albedo=0.8)
+    alone = Renderer(bank.mesh("cone"), bank.sensor.with_(recording_range_m=5e-3), albedo=0.8)
+    plain, both = cramer_rao(renderer, views), cramer_rao(renderer, views, systematic=("recording",))
+    np.testing.assert_allclose(both.covariance - plain.covariance, parts[0]["recording"][None], rtol=0.05)
+    # a range offset moves the distance along the ray: by more than itself seen from above, by less for a slanted face
+    grown = (cramer_rao(alone, views, systematic=("recording",)).covariance - plain.covariance)[0, 0, 0]
+    assert 0.8 < math.sqrt(grown) / 5e-3 < 1.2
 
 
 def test_a_stamp_that_jitters_adds_the_motion_of_its_time(bank):

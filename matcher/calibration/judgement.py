@@ -98,17 +98,20 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
 
 
 def _doubt_of_quantity(solution: Solution) -> list[str]:
-    """Doubt that the numbers are z, or ranges, where the other fits as well with a much smaller range offset."""
+    """Doubt that the numbers are z, or ranges, where the other fits much better, or as well with a smaller offset."""
     stated = _asked(solution.problem)
     own = _tried(stated, solution.edges)
     large_m, as_well = 0.015, 1.5  # range offset that is suspicious, and mean square residual over that of the other
     offset = abs(own.range_offset_m)
-    if offset < large_m:
-        return []
     for change, right in _other_quantities(stated):
         other = _tried(stated.changed(change), solution.edges)
         left = abs(other.range_offset_m)
-        if other.mean_square < as_well * own.mean_square and left < offset / 2:
+        if other.mean_square < min(_BETTER * own.mean_square, _FITS_M**2):
+            misfits = [1e3 * math.sqrt(one.mean_square) for one in (other, own)]
+            return [
+                f"{_AS}{right} the numbers fit better, with residuals of {misfits[0]:.2g} and not {misfits[1]:.2g} mm"
+            ]
+        if offset > large_m and other.mean_square < as_well * own.mean_square and left < offset / 2:
             return [
                 f"{_AS}{right} the numbers fit as well, with a range offset of {1e3 * left:.0f} mm in place of"
                 f" {1e3 * offset:.0f} mm"
@@ -126,9 +129,9 @@ def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
         if doubt.startswith(_AS):
             right = doubt.removeprefix(_AS).split()[0]
             return _QUANTITY.format(right=right)
-        if doubt.startswith(f"the {PARAMETERS['delay'].title} ran to"):
-            delay_s = float(solution.theta[ALL_NAMES.index("delay")])
-            return _CLOCKS.format(delay_ms=1e3 * delay_s)
+    if len(doubts) == 1 and doubts[0].startswith(f"the {PARAMETERS['delay'].title} ran to"):
+        delay_s = float(solution.theta[ALL_NAMES.index("delay")])
+        return _CLOCKS.format(delay_ms=1e3 * delay_s)
     if len(doubts) == 1 and "delay cannot be determined" in doubts[0]:
         return (
             "the camera hardly moves: turn and approach faster, or state the delay with Mounting(delay_s=…) and give"

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 _REFINED = (
     "free", "on", "pixels", "robust", "auto_background", "unknown_background", "no_background", "fix", "bearing_std",
+    "same_recording",
 )  # fmt: skip
 """Options of :class:`Search` that the nearest image does not have."""
 
@@ -88,6 +89,8 @@ class Search:
     no_background
         With refine: nothing returns beside it. Unless the background is stated, nothing, wall and floor, and unknown
         things are tried in turn, up to what explains the frame.
+    same_recording
+        With refine: the sensor was calibrated on these frames; leave out by what another recording differs.
     """
 
     filter_name: Literal["kalman", "phasor-mean"] = "kalman"
@@ -105,6 +108,7 @@ class Search:
     auto_background: bool = False
     unknown_background: bool = False
     no_background: bool = False
+    same_recording: bool = False
     wall: Wall = None
     floor: Floor = None
 
@@ -183,7 +187,7 @@ class Search:
 
     def _check_direct(self) -> None:
         """Refuse options that belong to images of ranges."""
-        for option in stated_flags(self, "pixels", "robust", "unknown_background", "filter_name"):
+        for option in stated_flags(self, "pixels", "robust", "unknown_background", "same_recording", "filter_name"):
             raise UsageError(f"{option} goes with images of ranges: leave it out with --on {self.on}")
         if self.auto_background and self.on == "targets":
             raise UsageError("--auto-background takes histograms: with --on targets give --wall and --floor")
@@ -191,6 +195,7 @@ class Search:
     def matcher(self, bank: Bank) -> Matcher:
         """Return the matcher."""
         from phasemark.matcher import Matcher
+        from phasemark.matcher.likelihood.systematic import SYSTEMATICS
 
         known: dict[str, Any] = {
             _FREE[name].replace("_", "_std_"): math.radians(std) if _FREE[name].endswith("_rad") else std
@@ -206,6 +211,7 @@ class Search:
             on=self.on or "ranges",
             pixels=self.pixels,
             robust=self.robust,
+            systematic=[term for term in SYSTEMATICS if term != "recording"] if self.same_recording else None,
             **known,
         )
 
