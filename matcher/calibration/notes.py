@@ -188,9 +188,7 @@ def recording_notes(use: NDArray[np.bool_], left_out: float, systematic: NDArray
     few = 8  # pixels of a frame, of which tilt, bearing and distance take three
     median = int(np.median(use.sum(axis=1)[use.any(axis=1)]))
     if median <= few:
-        notes.append(
-            f"Half of the frames count by {median} pixels or fewer: errors of these few pixels are errors of the result."
-        )
+        notes.append(f"Half of the frames count by {median} pixels or fewer: their errors are those of the result.")
     texts = ("{:.2g} mm in distance", "{:.2g}° in δ", "{:.2g}° in bearing", "{:.2g} mm in height", "{:.2g} ms in time")
     shown = systematic * [1e3, math.degrees(1), math.degrees(1), 1e3, 1e3]
     parts = [text.format(size) for text, size in zip(texts, shown, strict=True) if size > 0]
