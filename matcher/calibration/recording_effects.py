@@ -24,8 +24,8 @@ _Float = NDArray[np.float64]
 TURN = "turn"
 """By how much the landmark is turned against the axes of the poses, counter-clockwise: no number of the camera."""
 BETWEEN_RANGE_M, BETWEEN_ANGLE_RAD = 0.005, math.radians(0.8)
-"""Standard deviation of the difference of two recordings, where there is but one: measured on recordings of a VL53L5CX
-on a drone, whose range offsets were 6 and 15 mm, pitches 0.5° and 2.4°, bearings up to 1.2° apart."""
+"""Standard deviation of the difference of two recordings, where there is but one: about that of recordings of a
+VL53L5CX on a drone, calibrated one by one; two had range offsets of −6 and −15 mm, pitches of −0.5° and −2.4°."""
 _USUAL = {
     "range_offset": BETWEEN_RANGE_M / math.sqrt(2),
     "bearing": BETWEEN_ANGLE_RAD / math.sqrt(2),
