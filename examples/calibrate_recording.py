@@ -48,8 +48,15 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("csv", type=Path, help="the recording")
     parser.add_argument("--first-half", action="store_const", const="first", help="calibrate on the first half alone")
+    parser.add_argument("--write-distrusted", action="store_true", help="write what cannot be trusted, too")
+    parser.add_argument("--force", action="store_true", help="replace the results of an earlier run")
     parser.add_argument("--out", type=Path, default=Path("out/calibration"), help="folder of the results")
     arguments = parser.parse_args(argv)
+    sensor, figure = arguments.out / "sensor.toml", arguments.out / "residuals.png"
+    for path in (sensor, figure):
+        if path.exists() and not arguments.force:
+            print(f"error: {path} exists: give another --out, or --force to replace it", file=sys.stderr)
+            return 4
     try:
         recording = read_recording(arguments.csv, preset(SENSOR), COLUMNS, arguments.first_half)
         found = calibrate(
@@ -64,10 +71,12 @@ def main(argv: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 3
     if found.doubts:
-        print(f"error: nothing was written: {'; '.join(found.doubts)}. Likely cause: {found.cause}", file=sys.stderr)
-        return 3
+        said = f"{'; '.join(found.doubts)}. Likely cause: {found.cause}"
+        if not arguments.write_distrusted:
+            print(f"error: nothing was written: {said}", file=sys.stderr)
+            return 3
+        print(f"note: not to be trusted: {said}", file=sys.stderr)
     arguments.out.mkdir(parents=True, exist_ok=True)
-    sensor, figure = arguments.out / "sensor.toml", arguments.out / "residuals.png"
     sensor.write_text(found.to_toml(base_name=SENSOR), encoding="utf-8")
     residual_figure(found).savefig(figure, dpi=90)
     for name in found.free:

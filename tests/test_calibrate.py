@@ -741,9 +741,10 @@ def test_the_command_refuses_to_write_what_cannot_be_trusted(folder, tmp_path, c
     assert len(told.splitlines()) > 1
     assert error.startswith("error: nothing was written, for the calibration cannot be trusted")
     assert "are the landmark and its size right" in error
-    assert "--force" in error
+    assert "--write-distrusted" in error
     assert not (tmp_path / "cam.toml").exists()
-    assert command(folder[0], tmp_path, *free, "--force", **three) == 0
+    assert command(folder[0], tmp_path, *free, "--force", **three) == 3
+    assert command(folder[0], tmp_path, *free, "--write-distrusted", **three) == 0
     assert "# Not to be trusted: " in (tmp_path / "cam.toml").read_text()
 
 

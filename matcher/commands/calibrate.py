@@ -71,6 +71,7 @@ def calibrate_camera(
     plot: Path | None = None,
     workers: Workers = None,
     as_json: Json = False,
+    write_distrusted: bool = False,
     force: Force = False,
 ) -> None:
     """Find how a camera is mounted from frames of a landmark taken at known positions.
@@ -78,8 +79,8 @@ def calibrate_camera(
     Pitch, roll, height, bearing, field of view, range offset, from amplitudes the landmark's albedo, and with --moving
     the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
     range_offset, albedo and delay. A sensor with a lens has its terms in place of half angles, estimated where --free
-    names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted is not written without --force
-    (exit code 3).
+    names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted is not written (exit code 3)
+    without --write-distrusted.
 
     Parameters
     ----------
@@ -125,6 +126,8 @@ def calibrate_camera(
         What is explained: ranges, or phasors, which use amplitudes too; auto chooses.
     plot
         The figure of the residuals, .png; beside the sensor file otherwise.
+    write_distrusted
+        Write a result that cannot be trusted, too; the file then names the doubts.
     """
     from phasemark.data.shards.executor import processors
     from phasemark.matcher import calibrate
@@ -160,7 +163,7 @@ def calibrate_camera(
             progress=progress,
         )
     found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
-    _write_calibration(found, out, figure, base_name, force)
+    _write_calibration(found, out, figure, base_name, force, write_distrusted)
     if as_json:
         echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
         return
@@ -228,14 +231,16 @@ def _start(
     return start if delay_ms is None else replace(start, delay_s=delay_ms / 1e3)
 
 
-def _write_calibration(found: Calibration, out: Path, figure: Path, base_name: str, force: bool) -> None:
+def _write_calibration(
+    found: Calibration, out: Path, figure: Path, base_name: str, force: bool, write_distrusted: bool
+) -> None:
     """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted."""
     from phasemark.matcher.calibration.report import residual_figure
 
-    if found.doubts and not force:
+    if found.doubts and not write_distrusted:
         raise InputFileError(
             f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
-            f" {found.cause} (--force writes it all the same)"
+            f" {found.cause} (--write-distrusted writes it all the same)"
         )
     write_figure(figure, residual_figure(found), force, dpi=100)
     write_file(out, found.to_toml(base_name=readable(base_name)), force)
