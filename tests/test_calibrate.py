@@ -265,6 +265,15 @@ def test_a_wrong_pose_is_named():
     assert "scaled by χ²" in found.covariance_from
 
 
+def test_exchanged_poses_are_named_and_a_fit_without_a_model_is_doubted():
+    rng = np.random.default_rng([1, 3])
+    truth, poses = some_mounting(rng), some_poses(rng, 10)
+    frames, order = filtered(take(truth, poses, rng)), np.array([0, 5, 2, 3, 4, 1, 6, 7, 8, 9])
+    found = calibrate(MESH, frames, poses[order])
+    assert "times what noise leaves" in " ".join(found.doubts)
+    assert found.cause == "two poses are likely exchanged: pose 1 and pose 5"
+
+
 def test_cartesian_poses_are_the_inverse_of_the_robot_equations():
     """PHYSICS section 8, equations (11) and (12)."""
     rng = np.random.default_rng(5)
@@ -417,7 +426,8 @@ def test_the_command_writes_a_sensor_that_every_other_command_takes(folder, writ
     assert main(bank) == 0
     assert command(path, tmp_path) == 4  # it exists
     capsys.readouterr()
-    fixed = ("--force", "--fix", "roll,height,fov,albedo")
+    # the albedo is another than that of the bank
+    fixed = ("--force", "--write-distrusted", "--fix", "roll,height,fov,albedo")
     three = {"frames": "three.npz", "poses": "three.csv", "landmark": str(tmp_path / "bank.h5")}
     assert command(path, tmp_path, *fixed, **three) == 0
     printed = capsys.readouterr().out
@@ -876,11 +886,11 @@ def test_95_of_100_mistakes_with_recordings_are_named_or_mended():
     mended = stats.chi2.ppf(0.9999, len(FREE))
     right = {kind: 0 for kind in WRONG}
     for kind in WRONG:
-        for seed in range(50):
+        for seed in range(25):
             said, trusted = mistaken(kind, seed)
             right[kind] += WRONG[kind] in said or (kind in ("half", "delay") and trusted < mended)
-    print(f"mistakes with recordings, named or mended of 50 each: {right}")
-    assert sum(right.values()) >= 0.95 * 50 * len(WRONG)
+    print(f"mistakes with recordings, named or mended of 25 each: {right}")
+    assert sum(right.values()) >= 0.95 * 25 * len(WRONG)
 
 
 @pytest.mark.soak

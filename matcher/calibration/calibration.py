@@ -19,7 +19,7 @@ from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibration.judgement import cause_of_refusal, doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, Mounting, check_names
-from phasemark.matcher.calibration.problem import Problem
+from phasemark.matcher.calibration.problem import AstrayError, Problem
 from phasemark.matcher.calibration.recording_fit import solve_recording
 from phasemark.matcher.calibration.result import Calibration, concluded
 from phasemark.matcher.calibration.still_fit import solve_still
@@ -134,13 +134,11 @@ def calibrate(
     )
     each = [problem_of(own if one is None else one.frames(own), known) for own, known in (first, *others)]
     problem = replace(each[0], others=tuple(each[1:]))
-    if recorded:
-        try:
-            solution = solve_recording(problem)
-        except UsageError as error:
-            raise UsageError(f"{error}{cause_of_refusal(problem)}") from None
-    else:
-        solution = solve_still(problem, pose_std)
+    try:
+        solution = solve_recording(problem) if recorded else solve_still(problem, pose_std)
+    except UsageError as error:
+        cause = cause_of_refusal(problem) if recorded or isinstance(error, AstrayError) else ""
+        raise UsageError(f"{error}{cause}") from None
     doubts = doubts_about(solution)
     return concluded(solution, doubts, likely_cause(solution, doubts) if doubts else "")
 

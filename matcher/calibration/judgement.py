@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -60,6 +61,9 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
     most_frames_out = 0.15  # share of the frames of which most pixels may disagree
     if solution.frames_left_out > most_frames_out:
         doubts.append(f"most pixels of {100 * solution.frames_left_out:.0f} % of the frames disagree with their poses")
+    no_model = 20.0  # χ² a degree of freedom beyond which a covariance that is scaled by it means nothing
+    if solution.chi2 > no_model * solution.dof:
+        doubts.append(f"χ² is {solution.chi2 / solution.dof:.3g} times what noise leaves")
     if problem.track is not None:
         doubts += _doubts_of_recordings(solution)
     return tuple(doubts)
@@ -247,6 +251,7 @@ def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
                 (order[::-1], "the poses are likely in the reverse order of the frames"),
                 (np.roll(order, 1), "each frame likely belongs to the pose before: check the order"),
                 (np.roll(order, -1), "each frame likely belongs to the next pose: check the order"),
+                *_exchanged(stated),
             )
         ]
     else:
@@ -255,6 +260,23 @@ def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
             changes.append((_with_delay, late))
         changes += [(partial(_late, delay_s=delay_s), _CLOCKS) for delay_s in (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)]
     return [(stated.changed(change), sentence) for change, sentence in changes]
+
+
+def _exchanged(stated: Problem) -> list[tuple[NDArray[np.integer], str]]:
+    """Return orders of still poses in which two of those that fit worst are exchanged, each with its sentence."""
+    suspects = 4
+    fit = RecordingFit(stated)
+    try:
+        residual, seen = fit.seen(fit.approach())
+    except UsageError:  # a pose from which nothing can be rendered
+        return []
+    misfit = np.where(seen, np.minimum(np.abs(np.nan_to_num(residual)), _FITS_M), 0.0).sum(axis=1)
+    found: list[tuple[NDArray[np.integer], str]] = []
+    for i, j in itertools.combinations(sorted(np.argsort(-misfit)[:suspects].tolist()), 2):
+        order = np.arange(len(stated.poses))
+        order[[i, j]] = order[[j, i]]
+        found.append((order, f"two poses are likely exchanged: {stated.poses.where(i)} and {stated.poses.where(j)}"))
+    return found
 
 
 class _Tried(NamedTuple):

@@ -28,6 +28,10 @@ MOST_FRAMES = 800
 """Frames that enter, of all recordings; more are thinned evenly."""
 
 
+class AstrayError(UsageError):
+    """A descent led to where no camera can be: frames and poses do not belong together."""
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """Frames at known poses, and everything that is assumed of them.

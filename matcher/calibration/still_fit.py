@@ -22,12 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
+from phasemark import UsageError
 from phasemark.matcher.calibration import notes as sentences
 from phasemark.matcher.calibration.checks import check_observable, check_pixels, check_poses, check_view, returns_beside
 from phasemark.matcher.calibration.known_poses import PoseStd
 from phasemark.matcher.calibration.mounting import ALL_NAMES, columns_of
 from phasemark.matcher.calibration.mounting_model import LONGEST_STEP, POSE, CalibrationModel, Images, range_residual
-from phasemark.matcher.calibration.problem import FEWEST_POSES, Problem, Solution, in_image, rms
+from phasemark.matcher.calibration.problem import FEWEST_POSES, AstrayError, Problem, Solution, in_image, rms
 from phasemark.matcher.calibration.registration import OUTLINE, register
 from phasemark.matcher.chi_squared import p_values_of
 from phasemark.matcher.estimate.variances import RandomEffects
@@ -93,16 +94,21 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
     use = fit.pixels(model.images(theta), cautious=True)
     check_pixels(use, poses)
     check_observable(fit.information(theta, use), fit.free, fit.scale, poses)
-    place = fit.solve(theta, use)
     minima_cost = 50.0  # χ² that ending in a small minimum may cost; what fits worse has other reasons
-    if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
-        place = fit.search(place)
     estimated = None
-    if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
-        for _ in range(_ROUNDS):
-            estimated = fit.pose_std(place)
-            fit = fit_with(estimated)
-            place = fit.solve(place.theta, place.use, place.shift)
+    try:
+        place = fit.solve(theta, use)
+        if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
+            place = fit.search(place)
+        if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
+            for _ in range(_ROUNDS):
+                estimated = fit.pose_std(place)
+                fit = fit_with(estimated)
+                place = fit.solve(place.theta, place.use, place.shift)
+    except UsageError as error:
+        raise AstrayError(
+            f"frames and poses do not belong together: a fit led to where no camera can be ({error})"
+        ) from None
     return _solution(problem, fit, place, frames, estimated)
 
 
