@@ -281,6 +281,7 @@ def test_a_distance_at_which_few_pixels_answer_is_left_out():
         ([10], [1.0, 2.0], None, "each set of frames needs its distance: got 1 of frames and 2"),
         ([10], [0.0], None, "'distance' must be a positive number of metres, got 0"),
         ([10], [math.nan], None, "'distance' must be a positive number of metres, got nan"),
+        ([10], [1000.0], None, "the board at 1000 m is farther than 20 m: distances are in metres"),
         ([10], [1.0], [1.5], r"'albedo' must be in \(0, 1\], got 1.5"),
         ([10], [1.0], [0.5, 0.6], "one albedo, or one for each of the 1 distances, got 2"),
         ([1], [1.0], None, f"too few frames at 1 m: 1, but at least {FEWEST_FRAMES} are needed"),
@@ -292,6 +293,27 @@ def test_what_cannot_be_fitted_is_refused_in_one_line(frames, distances, albedo,
     with pytest.raises(UsageError, match=message) as caught:
         fit_sensor(boards, distances, base=PMD, albedo=albedo)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("across", "up"), [(25.0, 0.0), (-1.0, 0.0), (0.0, 1.5), (3.0, -4.0), (0.0, 0.0)])
+def test_a_tilted_board_is_named_with_its_angle(across, up):
+    """Ranges of a plane whose normal is turned, by the closed form; beyond 3° it is no flat field."""
+    rays = PMD.pixel_directions()
+    normal = np.array([1.0, math.tan(math.radians(across)), math.tan(math.radians(up))])
+    true = 1.0 / (rays @ normal)
+    rng = np.random.default_rng(3)
+    frames = Frames(true + 2e-3 * rng.standard_normal((50, 16, 16)), sensor=PMD)
+    angle = math.degrees(math.acos(1 / np.linalg.norm(normal)))
+    if angle > 3:
+        with pytest.raises(UsageError, match="the board at 1 m is tilted by about") as caught:
+            fit_sensor([frames], [1.0], base=PMD)
+        said = float(str(caught.value).split("about ")[1].split("°")[0])
+        assert said == pytest.approx(angle, rel=0.1)
+        return
+    notes = [note for note in fit_sensor([frames], [1.0], base=PMD).notes if "tilted" in note]
+    assert bool(notes) == (angle > 0)
+    if notes:
+        assert float(notes[0].split("about ")[1].split("°")[0]) == pytest.approx(angle, abs=0.06)
 
 
 @pytest.mark.parametrize(("value", "message"), [(math.nan, "no pixel is valid"), (1.0, "no noise")])

@@ -27,12 +27,9 @@ _BETTER = 0.5
 """Mean square of the residuals of an alternative, over that of what was assumed, from which it is the likely cause."""
 _FITS_M = 0.02
 """Root mean square residual below which an alternative fits at all."""
-_FRAMES_TRIED = 120
 _AS, _QUANTITY = "taken as ", "the numbers are likely {right}: give quantity={right}"
 _CLOCKS = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: are both in one clock? state the delay"
 _HALVES = "first", "second"
-_AS_GOOD = 2.0
-"""Mean square residual over the least, up to which alternatives are named together."""
 
 
 def doubts_about(solution: Solution) -> tuple[str, ...]:
@@ -170,7 +167,8 @@ def _better(stated: Problem, edges: bool | None) -> str:
             return f"the frames of the {part} half fit their poses, the others do not: are all poses of this recording?"
     if least > min(_BETTER * own_square, _FITS_M**2):
         return ""
-    alike = [text.format(delay_ms=1e3 * found.delay_s) for square, found, text in good if square <= _AS_GOOD * least]
+    as_good = 2.0  # mean square residual over the least, up to which alternatives are named together
+    alike = [text.format(delay_ms=1e3 * found.delay_s) for square, found, text in good if square <= as_good * least]
     return "; or ".join(dict.fromkeys(alike))
 
 
@@ -288,9 +286,10 @@ class _Tried(NamedTuple):
 
 def _tried(problem: Problem, edges: bool | None) -> _Tried:
     """Return how the best mounting no farther than what can be fits, on fewer frames than a calibration takes."""
+    frames_tried = 120
     try:
         if problem.moving:
-            problem = problem.changed(lambda one: one.by_time(_FRAMES_TRIED // len(problem.recordings))[0])
+            problem = problem.changed(lambda one: one.by_time(frames_tried // len(problem.recordings))[0])
         fit = RecordingFit(problem, edges=edges)
         found = fit.approach()
     except UsageError:

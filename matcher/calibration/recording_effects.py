@@ -23,21 +23,20 @@ _Float = NDArray[np.float64]
 
 TURN = "turn"
 """By how much the landmark is turned against the axes of the poses, counter-clockwise: no number of the camera."""
-BETWEEN_RANGE_M, BETWEEN_ANGLE_RAD = 0.005, math.radians(0.8)
+_BETWEEN_RANGE_M, _BETWEEN_ANGLE_RAD = 0.005, math.radians(0.8)
 """Standard deviation of the difference of two recordings, where there is but one: about that of recordings of a
 VL53L5CX on a drone, calibrated one by one; two had range offsets of −6 and −15 mm, pitches of −0.5° and −2.4°."""
 _USUAL = {
-    "range_offset": BETWEEN_RANGE_M / math.sqrt(2),
-    "bearing": BETWEEN_ANGLE_RAD / math.sqrt(2),
-    "pitch": BETWEEN_ANGLE_RAD / math.sqrt(2),
-    "roll": BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "range_offset": _BETWEEN_RANGE_M / math.sqrt(2),
+    "bearing": _BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "pitch": _BETWEEN_ANGLE_RAD / math.sqrt(2),
+    "roll": _BETWEEN_ANGLE_RAD / math.sqrt(2),
     "delay": 0.2,
     TURN: math.radians(0.5),
 }
 """Usual standard deviations of the errors of a recording, metres, radians, seconds."""
 _WORTH = 3.0
 """Recordings that the usual sizes are worth."""
-_ROUNDS = 50
 
 
 def own_names(free: tuple[str, ...], recordings: int, *, moving: bool) -> tuple[str, ...]:
@@ -85,7 +84,8 @@ class RecordingSizes:
         """
         usual = RecordingSizes.usual(self.names, self.recordings).std
         std, count = self.std, own.size
-        for _ in range(_ROUNDS):
+        rounds = 50  # of expectation and maximisation: far more than it takes
+        for _ in range(rounds):
             precision = prior.copy()
             precision[first : first + count] = np.tile(std**-2.0, self.recordings)
             pull = gradient.copy()

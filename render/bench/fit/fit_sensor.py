@@ -22,11 +22,24 @@ from phasemark.render.bench.fit.boards import (
 )
 from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Findings, SensorFit
 from phasemark.render.bench.fit.light import fit_light, limit_contrast
-from phasemark.render.bench.fit.ranges import fit_offsets, fit_pixels, odd_pixels, pixel_offsets
+from phasemark.render.bench.fit.ranges import board_tilts, fit_offsets, fit_pixels, odd_pixels, pixel_offsets
 from phasemark.render.frames import Frames
 from phasemark.render.integral.rounding import with_error
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_file import rounded
+
+
+def _check_tilt(data: BoardData, found: Findings) -> None:
+    """Refuse a board that is far from square to the camera, and note one that is nearly."""
+    angle, std = board_tilts(data)
+    seen_sigmas, noted_deg, most_deg = 5.0, 0.3, 3.0
+    tilt_deg = np.degrees(np.where(angle > seen_sigmas * std, angle, 0.0))
+    k = int(tilt_deg.argmax())
+    where = f"the board at {data.distance_m[k]:g} m is tilted by about {tilt_deg[k]:.2g}° against the optical axis"
+    if tilt_deg[k] > most_deg:
+        raise UsageError(f"{where}, which would be taken for offsets of pixels: set it square to the camera")
+    if tilt_deg[k] > noted_deg:
+        found.notes.append(f"{where[0].upper()}{where[1:]}: that is in the spread of the pixels' offsets.")
 
 
 def fit_sensor(
@@ -78,7 +91,8 @@ def fit_sensor(
     ------
     UsageError
         Numbers of frames, distances, albedos and standard deviations do not fit; there are too few frames; no pixel is
-        valid often enough; a standard deviation is negative or more than a tenth of its distance.
+        valid often enough; a board is farther than 20 m, or tilted by more than 3°; a standard deviation is negative or
+        more than a tenth of its distance.
     """
     base.refuse_several_frequencies("a fit")
     if len(frames) != len(distance_m) or not frames:
@@ -88,9 +102,12 @@ def fit_sensor(
     if amplitude_unit not in ("electrons", "arbitrary"):
         raise UsageError(f"'amplitude_unit' must be 'electrons' or 'arbitrary', got {amplitude_unit!r}")
     albedos = one_for_each(0.8 if albedo is None else albedo, distance_m, "albedo")
+    farthest_m = 20.0  # no board that fills the image stands farther: its distance is in another unit
     for one, distance in zip(frames, distance_m, strict=True):
         if len(one) != 1:
             raise UsageError(f"the frames at {distance:g} m must be of one position, got {len(one)}")
+        if distance > farthest_m:
+            raise UsageError(f"the board at {distance:g} m is farther than {farthest_m:g} m: distances are in metres")
         if one.n_frames < FEWEST_FRAMES:
             raise UsageError(
                 f"too few frames at {distance:g} m: {one.n_frames}, but at least {FEWEST_FRAMES} are needed to know a "
@@ -117,6 +134,7 @@ def fit_sensor(
     odd = odd_pixels(data, pixel_offsets(data, first)[0])
     data = data.without(odd)
     fit_offsets(data, found)
+    _check_tilt(data, found)
     offset, offset_error = fit_pixels(data, odd, found)
     fit_light(data, amplitude_unit, found)
     fields = {**base.model_dump(), **{name: rounded(value) for name, value in found.fields.items()}}

@@ -143,6 +143,25 @@ def pixel_offsets(data: BoardData, found: Findings) -> tuple[Floats, Floats, Flo
     return images[0], images[1], images[2]
 
 
+def board_tilts(data: BoardData) -> tuple[Floats, Floats]:
+    """Return by how much each board is tilted against the optical axis, with standard errors, (boards,) radians.
+
+    A board at D whose normal is turned by α has ranges that differ by −D tan α · (y, z)/x over the axis cosine, to
+    first order, at the ray (x, y, z) of a pixel; what is square to that is offset, wiggling and pattern.
+    """
+    rays = data.sensor.pixel_directions() @ data.sensor.cam2level  # along the camera's own axes
+    across, up = (rays[..., k][data.good] / rays[..., 0][data.good] ** 2 for k in (1, 2))
+    design = np.column_stack([np.ones_like(across), -across, -up])
+    angles = []
+    for distance, error in zip(data.distance_m, data.used([one.mean for one in data.error_m]), strict=True):
+        solution, covariance = weighted_fit(design, error, np.ones(len(error)))
+        freedom = max(len(error) - design.shape[1], 1)
+        variance = float(((error - design @ solution) ** 2).sum()) / freedom * np.diag(covariance)[1:].max()
+        angles.append((math.atan(math.hypot(*solution[1:]) / distance), math.sqrt(variance) / distance))
+    angle, std = np.transpose(angles)
+    return angle, std
+
+
 def odd_pixels(data: BoardData, offset_m: Floats) -> NDArray[np.bool_]:
     """Return pixels that are stuck, far noisier than the rest at their light, or far off; (rows, cols)."""
     good = data.good
