@@ -129,6 +129,12 @@ def returns_beside(model: CalibrationModel, evidence: Evidence) -> bool:
     return bool((evidence.seen.returned & _elsewhere(model, evidence)).mean() > far_returns)
 
 
+def check_enough(pixels: int, parameters: int) -> None:
+    """Refuse frames of which too few pixels agree with their poses to tell anything."""
+    if pixels <= parameters:
+        raise UsageError(f"only {pixels} pixels agree with the poses, for {parameters} numbers: {_BELONG}")
+
+
 def check_pixels(use: NDArray[np.bool_], poses: KnownPoses) -> None:
     """Refuse evidence of which no pixel counts, or at most poses none."""
     empty = np.flatnonzero(~use.any(axis=1))

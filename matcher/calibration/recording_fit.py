@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy import optimize, special
 
 from phasemark.matcher.calibration import notes as sentences
-from phasemark.matcher.calibration.checks import check_poses, check_ranges, check_view, returns_beside
+from phasemark.matcher.calibration.checks import check_enough, check_poses, check_ranges, check_view, returns_beside
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, columns_of, prior_std
 from phasemark.matcher.calibration.mounting_model import EFFECTS, CalibrationModel, Images, range_residual
 from phasemark.matcher.calibration.problem import MOST_FRAMES, Problem, Solution, in_image, rms
@@ -470,6 +470,7 @@ class RecordingFit:
                     break
             residual, seen = self.seen(place)
             use = self._gated(residual, seen, slopes[1], std, sizes, pose_error)
+            check_enough(int(use.sum()), len(self.free))
             linear = self.linear(slopes, residual, use, std)
             if fits_noise:
                 noise = self.noise(*self._left(linear, slopes[1], residual, use, std, sizes), use, noise)
