@@ -797,6 +797,7 @@ def test_recordings_that_differ_tell_the_camera_their_differences_and_a_turned_l
     found, base, other = several(0)
     assert not found.doubts
     assert "delay" not in found.free  # of the clocks of each recording
+    assert any("the sensor file keeps delay_s = 0" in note for note in found.notes)
     assert nees(found, base) < stats.chi2.ppf(1 - 5e-4, len(found.free))
     assert nees_of_another(found, other) < stats.chi2.ppf(1 - 5e-4, 4)
     assert 2e-3 < found.sensor.recording_range_m < 12e-3

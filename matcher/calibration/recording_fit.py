@@ -78,6 +78,11 @@ def solve_recording(problem: Problem) -> Solution:
         where = recorded.candidates(images, edges=fit.edges)
         check_ranges(recorded.model, recorded.evidence, np.where(where, recorded.residual(images), np.nan))
     solution = fit.solve(fit.approach())
+    if "delay" in fit.own:
+        notes.append(
+            "Each recording has its own delay, of its two clocks: the sensor file keeps"
+            f" delay_s = {problem.assumed.delay_s:g}; state there that of the recording to be matched."
+        )
     std = np.sqrt(np.diag(solution.covariance))
     prior = fit.prior * fit.scale
     from_prior = 0.7  # standard deviation over that of the prior, from which the data are said not to tell a number
