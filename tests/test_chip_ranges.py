@@ -19,6 +19,7 @@ from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer
 from phasemark.render.direct.chip_renderer import ChipRenderer
+from phasemark.render.sensor.sensor_file import sensor_toml
 
 SENSOR = preset("vl53l5cx-8x8")
 ANGLES = "delta_rad", "bearing_rad", "pitch_rad", "roll_rad"
@@ -116,6 +117,25 @@ def test_frames_of_a_chip_are_matched_whatever_stands_behind(scene):
     for angle in ANGLES:
         off = math.remainder(getattr(match, angle) - float(getattr(view, angle)[0]), period)
         assert abs(math.degrees(off)) < 1.0, angle
+
+
+def test_offsets_of_range_and_zones_are_in_what_a_chip_reports_and_taken_off_once(tmp_path):
+    table = np.random.default_rng(4).normal(0.0, 5e-3, (8, 8))
+    sensor = SENSOR.with_(range_offset_m=0.03, zone_offset_m=tuple(map(tuple, table.tolist())))
+    (tmp_path / "mine.toml").write_text(sensor_toml(sensor, {}, header=[], otherwise="assumed"), encoding="utf-8")
+    name, view, _ = view_of(*SCENES["nothing behind"])
+    plain, late = (
+        capture(HistogramRenderer(mesh(name), one).render_views(view), one, rng=np.random.default_rng(1), n_frames=15)
+        for one in (SENSOR, sensor)
+    )
+    later = np.nanmean(late.ranges.range_m - plain.ranges.range_m, axis=1)[0]
+    lit = np.isfinite(plain.ranges.range_m[0]).all(axis=0)
+    np.testing.assert_allclose(later[lit], (0.03 + table)[lit], atol=2e-3)
+    grid = {"distance_m": "0.5:0.58:0.02", "delta_deg": "0:180:4"}
+    with build_bank({"classes": (name,), "sensor": str(tmp_path / "mine.toml"), **grid}) as mine:
+        (match,) = Matcher(mine, "refine", on="reported").match(kalman_filter(late.ranges))
+    assert match.accepted
+    assert match.distance_m == pytest.approx(float(view.distance_m[0]), abs=3e-3)
 
 
 @pytest.mark.soak

@@ -240,7 +240,7 @@ class _Answers:
             answer["poses"] = self.place.poses(match, self.landmarks)
         self.reasons.append("" if match.accepted else match.reason or "no landmark")
         self.distances_m.append(match.distance_m)
-        self.n_mirrored += bool(match.may_be_mirrored)
+        self.n_mirrored += bool(match.accepted and match.may_be_mirrored)
         if isinstance(batch.filtered, FilteredFrames):
             if index in self.plots:
                 self.drawn[index] = batch.filtered[k : k + 1], match

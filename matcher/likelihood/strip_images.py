@@ -187,6 +187,8 @@ def _strip_sensor(sensor: Sensor, widest_columns: int) -> Sensor:
         fill_factor=(1.0, 1.0),
         dead_pixels=(),
         hot_pixels=(),
+        zone_offset_m=(),
+        histogram=None,
     )
 
 

@@ -135,7 +135,8 @@ class ChipRenderer(Renderer):
         nearest_m = np.where(sure, np.take_along_axis(distance, nearest, axis=-1)[..., 0], np.nan)
         shape = (len(views), sensor.rows, sensor.cols)
         forward: Any = sensor.axis_cosine() if histogram_of(sensor).reports == "z" else 1.0
-        return np.asarray(nearest_m.reshape(shape) / forward)
+        offset = sensor.zone_offsets + sensor.range_offset_m  # taken off measured ranges before they are compared
+        return np.asarray(nearest_m.reshape(shape) / forward - offset)
 
     def _signal(self, views: Views, background: Backgrounds, workers: int) -> NDArray[np.float64]:
         """Return the expected signal counts of landmark and background, (n, zones, bins)."""

@@ -85,6 +85,8 @@ def find_targets(frames: Counted) -> Targets:
 def place_to_range(place: NDArray[np.float64], sensor: Sensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Turn places in a histogram into what the sensor reports, and the metres per bin there.
 
+    A chip does not know its offsets of range and zones: what it reports is late by them.
+
     Parameters
     ----------
     place : (..., rows, cols, targets) float64
@@ -94,9 +96,8 @@ def place_to_range(place: NDArray[np.float64], sensor: Sensor) -> tuple[NDArray[
     histogram = histogram_of(sensor)
     width = histogram.bin_width_m * sensor.zone_values("zone_bin_scale")[..., None]
     mean_delay = np.array(response_means(sensor)).reshape(sensor.rows, sensor.cols, 1)
-    offset = (sensor.zone_offsets + sensor.range_offset_m)[..., None] + mean_delay
     cosine = sensor.axis_cosine()[..., None] if histogram.reports == "z" else np.ones((1, 1, 1))
-    return (histogram.start_m + place * width - offset) * cosine, width * cosine
+    return (histogram.start_m + place * width - mean_delay) * cosine, width * cosine
 
 
 def response_means(sensor: Sensor) -> list[float]:
