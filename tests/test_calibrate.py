@@ -30,6 +30,7 @@ from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS
 from phasemark.render import Background, Frames, Renderer, Sensor, Views, capture, preset
+from phasemark.render.direct import HistogramRenderer
 
 PMD = preset("pmd-16x16")
 MESH = build_mesh(catalog()["cylinder"])
@@ -542,6 +543,7 @@ def test_95_percent_ellipses_hold_the_truth_in_93_to_97_percent_of_500_runs(on):
 
 TOF = preset("vl53l5cx-8x8")
 BOARD = trimesh.creation.box((0.02, 2.0, 2.0))
+CONE = build_mesh(catalog()["cone"])
 FREE = ("pitch", "roll", "bearing", "half_angle_h", "range_offset", "delay")
 TURNING = Mounting(0.5 * DEGREE, -0.7 * DEGREE, 0.0, DEGREE, 22.8 * DEGREE, 22.5 * DEGREE, 0.01, 0.8, -0.075)
 TOF_NOISE = {"range_std_m": 2e-3, "range_ambient_std_m": 4e-3}
@@ -590,6 +592,55 @@ def moved(seed, n=40):
 @pytest.fixture(scope="module")
 def rides():
     return [moved(seed) for seed in (1, 2)]
+
+
+def part_of_zones(seed, n):
+    """Return frames of a chip that rides before a cone and a wall, the poses, and the mounting."""
+    rng = np.random.default_rng([2028, seed])
+    truth = Mounting(
+        *(1.5 * DEGREE * rng.standard_normal(2)), 0.0, 1.5 * DEGREE * rng.standard_normal(),
+        22.5 * DEGREE * (1 + 0.01 * rng.standard_normal()), 22.5 * DEGREE, 0.02 * rng.standard_normal(), 0.8,
+        rng.uniform(-0.1, 0.1),
+    )  # fmt: skip
+    stamps, phase = 10 + np.arange(n) / 15, rng.uniform(0, 6)
+
+    def ride_past(time):
+        delta, bearing = 0.5 * np.sin(0.7 * time + phase), 14 * DEGREE * np.sin(1.9 * time + 2 * phase)
+        return KnownPoses.polar(0.62 + 0.15 * np.sin(1.1 * time + phase), delta, bearing)
+
+    at, there = ride_past(stamps + truth.delay_s), truth.on(TOF).with_(bearing_offset_deg=0.0, delay_s=0.0)
+    views = Views(at.distance_m, at.delta_rad, at.bearing_rad + truth.bearing_rad, at.height_m)
+    counted = HistogramRenderer(CONE, there).render_views(views, background=Background(wall_m=1.6))
+    z_m = capture(counted, there, rng=rng, n_frames=1).ranges.z_m
+    time = np.arange(9.0, 11 + n / 15, 0.05)
+    frames = Frames(z_m / TOF.axis_cosine(), sensor=TOF, time_s=stamps[:, None])
+    return kalman_filter(frames), replace(ride_past(time), time_s=time), truth
+
+
+@pytest.mark.parametrize("seeds", [range(1), pytest.param(range(1, 21), marks=pytest.mark.soak)])
+def test_zones_that_a_landmark_fills_in_part_count_as_their_chip_reports_them(seeds):
+    """A cone fills few zones of 5.6° whole, and a wall behind it is not stated; NEES of 6 numbers are χ²."""
+    total = 0.0
+    for seed in seeds:
+        frames, poses, truth = part_of_zones(seed, 14)
+        found = calibrate(CONE, frames, poses, free=FREE, moving=True, on="reported")
+        assert not found.doubts
+        total += nees(found, truth)
+    assert total < stats.chi2.ppf(1 - 1e-3, 6 * len(seeds))
+    whole = calibrate(CONE, frames, poses, free=FREE, moving=True, on="ranges")
+    assert found.std("roll") < whole.std("roll") / 5
+
+
+def test_ranges_of_a_chip_take_its_table_and_no_stated_wall():
+    frames, poses, _ = part_of_zones(0, 12)
+    for wrong in (
+        {"background": Background(wall_m=1.6)},
+        {"frames": replace(frames, sensor=TOF.with_(histogram=None))},
+    ):
+        with pytest.raises(
+            UsageError, match=r"'on' = reported goes with a direct sensor that has a \[histogram\] table"
+        ):
+            calibrate(CONE, **{"frames": frames, "poses": poses, "moving": True, "on": "reported", **wrong})
 
 
 def test_delay_zone_offsets_noise_and_mounting_are_found_at_once(rides):

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Literal
+from typing import get_args
 
 import trimesh
 
@@ -19,6 +19,7 @@ from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibration.judgement import cause_of_refusal, doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, Mounting, check_names
+from phasemark.matcher.calibration.pose_frames import Explained
 from phasemark.matcher.calibration.problem import AstrayError, Problem
 from phasemark.matcher.calibration.recording_fit import solve_recording
 from phasemark.matcher.calibration.result import Calibration, concluded
@@ -38,7 +39,7 @@ def calibrate(
     fixed: Sequence[str] = (),
     start: Mounting | None = None,
     albedo: float = 0.8,
-    on: ResidualKind | Literal["auto"] = "auto",
+    on: Explained = "auto",
     background: Background | None = None,
     pose_std: PoseStd | None = None,
     reports_z: bool | None = None,
@@ -75,9 +76,10 @@ def calibrate(
         Initial guess of the mounting, and the values of what is fixed; None: what the sensor states.
     albedo : float
         Of the landmark, as assumed.
-    on : {"auto", "ranges", "phasors"}
+    on : {"auto", "ranges", "reported", "phasors"}
         "auto": phasors where the frames have amplitude and intensity. Of several modulation frequencies the unwrapped
-        ranges.
+        ranges. "reported": ranges as the chip of a direct sensor with a [histogram] table makes them, of the nearest
+        surface of each zone; zones that a landmark fills in part then count, whatever stands behind it.
     background : Background, optional
         What stands behind; a pose's own `wall_m` replaces its wall. Without one, where more than a few pixels return
         beside the landmark, only those that see nothing else count.
@@ -111,12 +113,18 @@ def calibrate(
     first, *others = _recordings(frames, poses, moving)
     camera = first[0].sensor
     one = OneFrequency(camera, "combined") if len(camera.frequencies_hz) > 1 else None
-    recorded = moving or bool(zones)
+    recorded = moving or bool(zones) or on == "reported"
     quantity = _quantity(first[0], on, recorded)
     sensor = camera if one is None else one.frames(first[0]).sensor
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
-    lit = quantity == "phasors" or background is not None or first[1].wall_m is not None
+    behind = background is not None or first[1].wall_m is not None
+    if on == "reported" and (sensor.histogram is None or behind):
+        raise UsageError(
+            "'on' = reported goes with a direct sensor that has a [histogram] table, and takes what stands behind the"
+            " landmark for unknown: leave walls and floors out"
+        )
+    lit = quantity == "phasors" or behind
     usual_renderings = 400  # of all poses: what a progress bar reckons with
     problem_of = partial(
         Problem,
@@ -130,6 +138,7 @@ def calibrate(
         workers=workers,
         rendered=counter(progress, usual_renderings * (1 + len(others))),
         one=one,
+        chip=on == "reported",
         moving=moving,
     )
     each = [problem_of(own if one is None else one.frames(own), known) for own, known in (first, *others)]
@@ -159,10 +168,10 @@ def _recordings(
     return list(zip(measured, known, strict=True))
 
 
-def _quantity(frames: FilteredFrames, on: ResidualKind | Literal["auto"], recorded: bool) -> ResidualKind:
+def _quantity(frames: FilteredFrames, on: Explained, recorded: bool) -> ResidualKind:
     """Return the quantity that is compared; refuse phasors where only ranges can be."""
-    if on not in ("auto", "ranges", "phasors"):
-        raise UsageError(f"'on' must be auto, ranges or phasors, got {on!r}")
+    if on not in get_args(Explained):
+        raise UsageError(f"'on' must be {', '.join(get_args(Explained)[:-1])} or phasors, got {on!r}")
     several = len(frames.sensor.frequencies_hz) > 1
     if several and on == "phasors":
         raise UsageError(
@@ -174,7 +183,7 @@ def _quantity(frames: FilteredFrames, on: ResidualKind | Literal["auto"], record
     has_light = frames.amplitude_e is not None and frames.intensity_e is not None and frames.sensor.kind == "phase"
     if on == "auto":
         return "phasors" if has_light and not recorded and not several else "ranges"
-    return on
+    return "phasors" if on == "phasors" else "ranges"
 
 
 def _names(

@@ -23,6 +23,7 @@ from phasemark.matcher.calibration.pose_track import PoseTrack
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
+from phasemark.render.direct.chip_renderer import ChipRenderer
 from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.lens_map import distort
 from phasemark.render.sensor.lens_rates import lens_rates
@@ -131,6 +132,8 @@ class CalibrationModel:
         Time stamps of the frames, with `track`.
     one : OneFrequency, optional
         How a camera of several modulation frequencies becomes `sensor`; None: it has one frequency.
+    chip : bool
+        Whether ranges are those of the nearest target that the chip of a direct sensor reports, not means over a zone.
     """
 
     def __init__(
@@ -147,6 +150,7 @@ class CalibrationModel:
         track: PoseTrack | None = None,
         stamp_s: NDArray[np.float64] | None = None,
         one: OneFrequency | None = None,
+        chip: bool = False,
     ) -> None:
         self.scale = natural_units(sensor)
         """Natural units, in the order of :data:`ALL_NAMES`; those of the lens of this sensor."""
@@ -156,9 +160,12 @@ class CalibrationModel:
         self._track, self._stamp_s = track, stamp_s
         self._axis_cosine = sensor.axis_cosine() if reports_z else None
         self._albedo = albedo
-        self._renderer = Renderer(mesh, sensor if one is None else one.camera, albedo=albedo, harmonics=())
-        if one is not None:
-            self._renderer = OneFrequencyRenderer(self._renderer, one)
+        if chip:
+            self._renderer: Renderer = ChipRenderer(mesh, sensor, albedo=albedo)
+        elif one is None:
+            self._renderer = Renderer(mesh, sensor, albedo=albedo, harmonics=())
+        else:
+            self._renderer = OneFrequencyRenderer(Renderer(mesh, one.camera, albedo=albedo, harmonics=()), one)
         self._scenes = [(np.arange(len(poses)), background)]
         if poses.wall_m is not None:
             base = background or Background()

@@ -13,8 +13,10 @@ from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, assumed_std_m
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.filters.mean_phasor import phasor_mean
-from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.render import Frames
+
+Explained = Literal["auto", "ranges", "reported", "phasors"]
+"""What a calibration may explain."""
 
 
 def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]:
@@ -64,14 +66,14 @@ def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]
     return [whole.some_frames(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]
 
 
-def filter_poses(frames: Sequence[Frames], on: ResidualKind | Literal["auto"] = "auto") -> FilteredFrames:
+def filter_poses(frames: Sequence[Frames], on: Explained = "auto") -> FilteredFrames:
     """Filter the frames of each pose: the mean phasor where phasors will be compared, else the Kalman filter.
 
     Parameters
     ----------
     frames : sequence of Frames
         One position each, of one camera; they may differ in number.
-    on : {"auto", "ranges", "phasors"}
+    on : {"auto", "ranges", "reported", "phasors"}
         As for :func:`~phasemark.matcher.calibrate`.
 
     Returns

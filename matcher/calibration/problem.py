@@ -55,6 +55,8 @@ class Problem:
         Called each time all poses have been rendered.
     one : OneFrequency, optional
         How a camera of several modulation frequencies became that of the frames.
+    chip : bool
+        Whether ranges are explained as the chip of a direct sensor reports them.
     track : PoseTrack, optional
         Of a moving camera.
     others : tuple of Problem
@@ -77,6 +79,7 @@ class Problem:
     workers: int
     rendered: Callable[[], None]
     one: OneFrequency | None
+    chip: bool = False
     track: PoseTrack | None = None
     others: tuple[Problem, ...] = ()
     moving: bool = False
@@ -116,6 +119,7 @@ class Problem:
             track=self.track,
             stamp_s=self.frames.time_s,
             one=self.one,
+            chip=self.chip,
         )
 
     def poses_with(self, delay_s: float) -> KnownPoses:

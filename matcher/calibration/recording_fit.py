@@ -177,7 +177,7 @@ class RecordingFit:
         self.stated_weight = np.concatenate([one.evidence.weight for one in self.recorded])
         direct = self.sensor.kind == "direct"
         if edges is None:
-            edges = all(
+            edges = problem.chip or all(
                 one.model.has_background or not (direct or returns_beside(one.model, one.evidence))
                 for one in self.recorded
             )
@@ -189,6 +189,7 @@ class RecordingFit:
         self.stated_zones = self.sensor.zone_offsets.ravel()
         self.own = own_names(problem.names, len(self.recorded), moving=problem.track is not None)
         self.least = np.zeros(len(EFFECTS))
+        self.least_noise_m = max(_LEAST_NOISE_M, problem.frames.chip_error_m if problem.chip else 0.0)
         self._set_blocks()
 
     def _set_blocks(self) -> None:
@@ -397,7 +398,7 @@ class RecordingFit:
             found = np.zeros(len(terms))
             for _ in range(8):
                 found = optimize.nnls(design / variance[:, None], square / variance)[0]
-                variance = np.maximum(design @ found, _LEAST_NOISE_M**2)
+                variance = np.maximum(design @ found, self.least_noise_m**2)
             cost = float((np.log(variance) + square / variance).sum()) + term_shows * len(terms)
             if cost < best[0]:
                 parts = dict(zip(terms, np.sqrt(found).tolist(), strict=True))
@@ -409,7 +410,7 @@ class RecordingFit:
         constant, shot, ambient = noise
         sensor = self.sensor.with_(range_std_m=constant, range_shot_std_m=shot, range_ambient_std_m=ambient)
         law = direct_range_std(0.8 / np.maximum(self.seen_range_m, 1e-3) ** 2, sensor)
-        return np.asarray(np.maximum(law, _LEAST_NOISE_M))
+        return np.asarray(np.maximum(law, self.least_noise_m))
 
     # the whole
 
@@ -460,7 +461,7 @@ class RecordingFit:
         if fits_noise:
             residual, seen = self.seen(place._replace(zone=np.zeros_like(place.zone)))
             spread = _spread(residual[seen & (np.abs(residual) < _FIRST_GATE_M)])
-            std = np.full(std.shape, max(min(spread, 0.02), _LEAST_NOISE_M))
+            std = np.full(std.shape, max(min(spread, 0.02), self.least_noise_m))
         pose_error = None
         for count in range(1, _MOST_ROUNDS + 1):
             slopes, first, before = self.slopes(place), pose_error is None, place.theta

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from phasemark.matcher import FilteredFrames
     from phasemark.matcher.calibration import Mounting
     from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
+    from phasemark.matcher.calibration.pose_frames import Explained
     from phasemark.matcher.calibration.result import Calibration
     from phasemark.render import Frames, Sensor
 
@@ -64,7 +65,7 @@ def calibrate_camera(
     delta_std: Degrees | None = None,
     landmark_xy: Annotated[tuple[float, float], Shown(metavar="X Y")] = (0.0, 0.0),
     landmark_yaw: Degrees = 0.0,
-    on: Literal["auto", "ranges", "phasors"] = "auto",
+    on: Literal["auto", "ranges", "reported", "phasors"] = "auto",
     wall: Wall = None,
     floor: Floor = None,
     reading: FrameReading,
@@ -123,7 +124,8 @@ def calibrate_camera(
     landmark_yaw
         Heading of its x' axis.
     on
-        What is explained: ranges, or phasors, which use amplitudes too; auto chooses.
+        What is explained: ranges, ranges as a chip reports them (reported), or phasors, which use amplitudes too; auto
+        chooses.
     plot
         The figure of the residuals, .png; beside the sensor file otherwise.
     write_distrusted
@@ -181,7 +183,7 @@ def _pose_std(position: float | None, heading_deg: float | None, delta_deg: floa
 
 
 def _filtered(
-    measured: Sequence[Frames], known: Sequence[KnownPoses], on: Literal["auto", "ranges", "phasors"], moving: bool
+    measured: Sequence[Frames], known: Sequence[KnownPoses], on: Explained, moving: bool
 ) -> list[FilteredFrames]:
     """Return the frames of each recording one by one, and those of a still camera averaged at each pose."""
     from phasemark.matcher import kalman_filter

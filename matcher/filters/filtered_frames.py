@@ -142,15 +142,17 @@ class FilteredFrames:
             by_frequency=tuple(part.without_offset() for part in self.by_frequency),
         )
 
+    @property
+    def chip_error_m(self) -> float:
+        """Error of a chip's target beside its noise, metres: rounding, and what it makes of a surface that bends."""
+        chip_error_bins = 0.03  # rounding to millimetres, and what stands beside, or bends within, a zone
+        return 0.0 if self.sensor.histogram is None else chip_error_bins * self.sensor.histogram.bin_width_m
+
     def with_chip_error(self) -> FilteredFrames:
         """Return reported ranges with what the chip's estimator leaves beside their noise, which no mean lessens."""
-        histogram = self.sensor.histogram
-        if histogram is None or not self.n_effective.max(initial=0.0) > 1:
+        if not self.chip_error_m or not self.n_effective.max(initial=0.0) > 1:
             return self
-        # error of a chip's target, in bins: rounding to millimetres, and what its estimator makes of a surface that
-        # bends within a zone, or of things beside it
-        chip_error_bins = 0.03
-        return replace(self, std_m=np.hypot(self.std_m, chip_error_bins * histogram.bin_width_m))
+        return replace(self, std_m=np.hypot(self.std_m, self.chip_error_m))
 
     def with_pooled_noise(self) -> FilteredFrames:
         """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
