@@ -848,7 +848,7 @@ def test_recordings_that_differ_tell_the_camera_their_differences_and_a_turned_l
     found, base, other = several(0)
     assert not found.doubts
     assert "delay" not in found.free  # of the clocks of each recording
-    assert any("the sensor file keeps delay_s = 0" in note for note in found.notes)
+    assert any("the sensor file keeps delay_s = 0. Find that of" in note for note in found.notes)
     assert nees(found, base) < stats.chi2.ppf(1 - 5e-4, len(found.free))
     assert nees_of_another(found, other) < stats.chi2.ppf(1 - 5e-4, 4)
     assert 2e-3 < found.sensor.recording_range_m < 12e-3
@@ -867,6 +867,62 @@ def test_one_recording_says_by_what_another_would_differ_and_that_this_was_assum
     assert found.sensor.recording_range_m == pytest.approx(5e-3)
     assert found.sensor.recording_pitch_deg == pytest.approx(0.8)
     assert "assumed: by how much two recordings of one sensor differed" in found.to_toml(base_name="tof")
+
+
+def delay_of_another(seed, found, truth, zone, n=20):
+    """Find the delay of a recording of a calibrated camera that was put on again; return its error over its σ."""
+    rng = np.random.default_rng([79, seed])
+    other = truth.vector[:9] + APART * rng.standard_normal(9)
+    other[-1] = rng.uniform(-0.12, 0.12)
+    frames, poses, _ = record(rng, Mounting(*other), n, zone=zone, turn=0.5 * DEGREE * rng.standard_normal())
+    z_m = frames.range_m * TOF.axis_cosine()
+    again = Frames((z_m / found.sensor.axis_cosine())[:, None], sensor=found.sensor, time_s=frames.time_s[:, None])
+    delay = calibrate(BOARD, kalman_filter(again), poses, free=["delay"], moving=True)
+    assert not delay.doubts
+    return (delay.value("delay") - other[-1]) / delay.std("delay"), delay
+
+
+def test_the_delay_of_another_recording_is_found_alone_and_the_calibration_kept(rides):
+    """The sum of 6 squares of errors over σ is χ²(6); the recording differs in what the sensor states of recordings."""
+    _, found, truth, zone = rides[0]
+    errors, delays = zip(*(delay_of_another(seed, found, truth, zone) for seed in range(6)), strict=True)
+    assert stats.chi2.ppf(5e-4, 6) < np.square(errors).sum() < stats.chi2.ppf(1 - 5e-4, 6)
+    for one in delays:
+        assert one.free == ("delay",)
+        assert 1e-4 < one.std("delay") < 0.01  # of 1.3 s
+        assert {"range_offset", "pitch", "roll", "bearing", "turn"} == set(one.own[0])
+        kept, before = one.sensor.model_dump(), found.sensor.model_dump()
+        changed = {name for name in kept if kept[name] != before[name]}
+        assert changed == {"delay_s", "calibration_fields", "calibration_covariance"}
+        own, old = one.sensor.calibration_fields, found.sensor.calibration_fields
+        assert set(own) == set(old)
+        same = [name for name in old if name != "delay_s"]
+        matrix, first = one.sensor.calibration_matrix, found.sensor.calibration_matrix
+        of_own, of_old = [own.index(name) for name in same], [old.index(name) for name in same]
+        np.testing.assert_array_equal(matrix[np.ix_(of_own, of_own)], first[np.ix_(of_old, of_old)])
+
+
+def test_a_delay_alone_takes_one_recording_that_moves_and_is_not_too_short(rides):
+    _, found, truth, zone = rides[0]
+    frames, poses, _ = record(np.random.default_rng(5), truth, 20, zone=zone)
+    with pytest.raises(UsageError, match="each recording has a delay of its own"):
+        calibrate(BOARD, [frames, frames], [poses, poses], free=["delay"], moving=True)
+    with pytest.raises(UsageError, match=r"frames with a pose span less than 0\.5 s"):
+        calibrate(BOARD, frames[:6], poses, free=["delay"], moving=True)
+    still = replace(frames, sensor=found.sensor, range_m=np.repeat(frames.range_m[:1], len(frames), axis=0))
+    first = np.argmin(np.abs(poses.time_s - frames.time_s[0] - truth.delay_s))
+    there = replace(poses[np.full(len(poses), first)], time_s=poses.time_s)
+    doubts = calibrate(BOARD, still, there, free=["delay"], moving=True).doubts
+    assert "the delay cannot be determined" in " ".join(doubts)
+
+
+@pytest.mark.soak
+def test_delays_of_other_recordings_are_within_two_sigma_in_90_to_99_percent_of_200():
+    for n in (12, 40):
+        cameras = [moved(seed)[1:] for seed in range(10)]
+        inside = sum(abs(delay_of_another(seed, *cameras[seed % 10], n)[0]) < 2 for seed in range(200))
+        print(f"delay of another recording of {n} frames: {inside} of 200 within 2 standard deviations")
+        assert 180 <= inside <= 198
 
 
 def test_recordings_and_poses_go_together(rides):

@@ -391,6 +391,15 @@ def test_the_time_of_a_pose_has_the_delay_of_the_sensor_and_moves_repeated_stamp
     (still,) = rows_of(tmp_path / "still.csv")
     assert float(still["time_s"]) == pytest.approx(0.175)
     assert float(still["pose_time_s"]) == pytest.approx(0.1)  # the mean of 0, 0.1, 0.2 and 0.3, less 0.05
+    assert run(*match, "--moving", "--delay-ms", 20, "--estimates", tmp_path / "own.csv")[0] == 0
+    own = [float(row["pose_time_s"]) for row in rows_of(tmp_path / "own.csv")]
+    np.testing.assert_allclose(own, [0.02, 0.12, 0.22, 0.32], atol=1e-9)
+    np.savez(tmp_path / "bare.npz", range=ranges, unit="m", quantity="range")
+    bare = ["match", bank, tmp_path / "bare.npz", "--method", "nearest", "--no-diagnosis", "--delay-ms"]
+    for delay_ms, part in ((20, "is added to time stamps, and these frames have none"), ("nan", "must be from -10000")):
+        code, _, err = run(*bare, delay_ms)
+        assert (code, err.count("\n")) == (2, 1)
+        assert part in err
 
 
 def test_the_summary_counts_reasons_and_names_the_end_of_the_bank(run, folder, tmp_path):

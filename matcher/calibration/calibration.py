@@ -94,7 +94,7 @@ def calibrate(
         plus the delay, and the delay is among what can be free. On ranges.
     zones : bool, optional
         Whether to estimate the offsets of zones, the noise law and systematic errors of a direct sensor; None: with
-        `moving`.
+        `moving`, unless the delay alone is free.
     workers : int
         Threads that render.
     progress : callable (done, total), optional
@@ -126,21 +126,26 @@ def calibrate(
         )
     lit = quantity == "phasors" or behind
     usual_renderings = 400  # of all poses: what a progress bar reckons with
+    names = _names(free, fixed, sensor, lit, moving, recorded)
+    if zones is None:  # a delay alone leaves what a calibration found of the zones
+        zones = moving and names != ("delay",)
     problem_of = partial(
         Problem,
         mesh,
         assumed=_assumed(start, sensor, albedo),
-        names=_names(free, fixed, sensor, lit, moving, recorded),
+        names=names,
         on=quantity,
         background=background,
         reports_z=sensor.quantity == "z" if reports_z is None else reports_z,
-        zones=recorded and zones is not False and sensor.kind == "direct",
+        zones=zones and sensor.kind == "direct",
         workers=workers,
         rendered=counter(progress, usual_renderings * (1 + len(others))),
         one=one,
         chip=on == "reported",
         moving=moving,
     )
+    if others and names == ("delay",):
+        raise UsageError("each recording has a delay of its own: with free=delay give one recording at a time")
     each = [problem_of(own if one is None else one.frames(own), known) for own, known in (first, *others)]
     problem = replace(each[0], others=tuple(each[1:]))
     try:

@@ -170,7 +170,9 @@ def untold_notes(untold: Sequence[str]) -> list[str]:
     ]
 
 
-def recording_notes(use: NDArray[np.bool_], left_out: float, systematic: NDArray[np.float64]) -> list[str]:
+def recording_notes(
+    use: NDArray[np.bool_], left_out: float, systematic: NDArray[np.float64], *, in_file: bool
+) -> list[str]:
     """Note how many pixels disagreed, and which errors noise does not explain.
 
     Parameters
@@ -180,6 +182,8 @@ def recording_notes(use: NDArray[np.bool_], left_out: float, systematic: NDArray
         Share of the pixels that disagreed.
     systematic : (5,) float64
         Standard deviations of pose errors: distance, δ, bearing, height, time.
+    in_file : bool
+        Whether they become those of the sensor file.
     """
     notes = [
         f"{int(use.sum())} pixels of {int(use.any(axis=1).sum())} frames counted; {100 * left_out:.1f} % of those that"
@@ -194,7 +198,7 @@ def recording_notes(use: NDArray[np.bool_], left_out: float, systematic: NDArray
     parts = [text.format(size) for text, size in zip(texts, shown, strict=True) if size > 0]
     if parts:
         notes.append(
-            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations): systematic errors"
-            " of the sensor file."
+            f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations)"
+            f"{': systematic errors of the sensor file' if in_file else ''}."
         )
     return notes

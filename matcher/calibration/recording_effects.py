@@ -12,12 +12,15 @@ variance of Student's t in place of a normal law.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.calibration.mounting import PARAMETERS
+from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS
+from phasemark.render import Sensor
 
 _Float = NDArray[np.float64]
 
@@ -43,10 +46,28 @@ _WORTH = 3.0
 """Recordings that the usual sizes are worth."""
 
 
-def own_names(free: tuple[str, ...], recordings: int, *, moving: bool) -> tuple[str, ...]:
-    """Return the names of what each recording may have of its own: of a single one the landmark's turn alone."""
-    names = tuple(name for name in _USUAL if name in free) if recordings > 1 else ()
-    return (*names, TURN) if moving else names
+def stated_apart(sensor: Sensor, free: Collection[str]) -> dict[str, float]:
+    """Return by how much a recording differs in each number that a calibration left and that is not free.
+
+    Parameters
+    ----------
+    sensor : Sensor
+        With `recording_range_m` and its neighbours, or without: then nothing is stated.
+    free : collection of str
+
+    Returns
+    -------
+    dict of str to float
+        Standard deviations, metres and radians, with those of the calibration.
+    """
+    calibrated = dict(zip(sensor.calibration_fields, np.diag(sensor.calibration_matrix).tolist(), strict=True))
+    found = {}
+    for one in PARAMETERS.values():
+        if one.field in RECORDING_FIELDS and one.name not in free:
+            apart = float(getattr(sensor, RECORDING_FIELDS[one.field]))
+            if apart:
+                found[one.name] = math.hypot(apart, math.sqrt(calibrated.get(one.field, 0.0))) / one.in_file
+    return found
 
 
 @dataclass(frozen=True)
@@ -57,18 +78,34 @@ class RecordingSizes:
     ----------
     names : tuple of str
     recordings : int
-    std : (q,) float64
-        Metres, radians, seconds.
+    std, usual : (q,) float64
+        Now, and before a frame is seen; metres, radians, seconds.
     """
 
     names: tuple[str, ...]
     recordings: int
     std: _Float
+    usual: _Float
 
     @classmethod
-    def usual(cls, names: tuple[str, ...], recordings: int) -> RecordingSizes:
-        """Return the sizes before a frame is seen."""
-        return cls(names, recordings, np.array([_USUAL[name] for name in names]))
+    def of(cls, free: Collection[str], recordings: int, *, moving: bool, stated: Mapping[str, float]) -> RecordingSizes:
+        """Return the sizes before a frame is seen, of all that each recording may have of its own.
+
+        Parameters
+        ----------
+        free : collection of str
+            Names of what is estimated: several recordings have errors of their own in these, a single one has none.
+        recordings : int
+        moving : bool
+            Whether the landmark may be turned against the poses.
+        stated : mapping of str to float
+            From :func:`stated_apart`.
+        """
+        own = {name: _USUAL[name] for name in _USUAL if recordings > 1 and name in free} | dict(stated)
+        if moving:
+            own[TURN] = _USUAL[TURN]
+        usual = np.array(list(own.values()))
+        return cls(tuple(own), recordings, usual, usual)
 
     def most_likely(
         self, information: _Float, gradient: _Float, prior: _Float, own: _Float, first: int
@@ -86,7 +123,6 @@ class RecordingSizes:
         first : int
             Where they begin among the parameters, whose unit they have.
         """
-        usual = RecordingSizes.usual(self.names, self.recordings).std
         std, count = self.std, own.size
         rounds = 50  # of expectation and maximisation: far more than it takes
         for _ in range(rounds):
@@ -97,9 +133,9 @@ class RecordingSizes:
             covariance = np.linalg.inv(information + np.diag(precision))
             there = own.ravel() + (covariance @ pull)[first : first + count]
             square = (there**2 + np.diag(covariance)[first : first + count]).reshape(own.shape).sum(axis=0)
-            std = np.sqrt((_WORTH * usual**2 + square) / (_WORTH + self.recordings))
+            std = np.sqrt((_WORTH * self.usual**2 + square) / (_WORTH + self.recordings))
         known = _WORTH + self.recordings - 1
-        return RecordingSizes(self.names, self.recordings, std * math.sqrt(known / (known - 2)))
+        return replace(self, std=std * math.sqrt(known / (known - 2)))
 
     def of_another(self, name: str) -> float:
         """Return by how much another recording differs from the calibrated number, standard deviation.

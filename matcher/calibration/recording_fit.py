@@ -26,12 +26,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
+from phasemark import UsageError
 from phasemark.matcher.calibration import notes as sentences
 from phasemark.matcher.calibration.checks import check_enough, check_poses, check_ranges, check_view, returns_beside
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, columns_of, prior_std
 from phasemark.matcher.calibration.mounting_model import EFFECTS, CalibrationModel, Images, range_residual
 from phasemark.matcher.calibration.problem import MOST_FRAMES, Problem, Solution, in_image, rms
-from phasemark.matcher.calibration.recording_effects import TURN, RecordingSizes, own_names
+from phasemark.matcher.calibration.recording_effects import TURN, RecordingSizes, stated_apart
 from phasemark.matcher.estimate.variances import RandomEffects
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.systematic import RECORDING_FIELDS
@@ -81,7 +82,8 @@ def solve_recording(problem: Problem) -> Solution:
     if "delay" in fit.own:
         notes.append(
             "Each recording has its own delay, of its two clocks: the sensor file keeps"
-            f" delay_s = {problem.assumed.delay_s:g}; state there that of the recording to be matched."
+            f" delay_s = {problem.assumed.delay_s:g}. Find that of a recording to be matched by a calibration of this"
+            " sensor file with free=delay, and state it by pose_times_s(delay_s=…)."
         )
     std = np.sqrt(np.diag(solution.covariance))
     prior = fit.prior * fit.scale
@@ -187,7 +189,10 @@ class RecordingFit:
         natural = self.recorded[0].model.scale
         self.prior = np.array([prior_std(name, self.assumed, natural) for name in self.free]) / self.scale
         self.stated_zones = self.sensor.zone_offsets.ravel()
-        self.own = own_names(problem.names, len(self.recorded), moving=problem.track is not None)
+        apart = stated_apart(self.sensor, problem.names)
+        moving = problem.track is not None
+        self.usual_own = RecordingSizes.of(problem.names, len(self.recorded), moving=moving, stated=apart)
+        self.own = self.usual_own.names
         self.least = np.zeros(len(EFFECTS))
         self.least_noise_m = max(_LEAST_NOISE_M, problem.frames.chip_error_m if problem.chip else 0.0)
         self._set_blocks()
@@ -206,6 +211,11 @@ class RecordingFit:
         self.recording = np.repeat(np.arange(len(blocks)), [len(one) for one in blocks])
         self.start = np.flatnonzero(np.diff(block, prepend=-1) != 0)
         self.single = len(self.start) == len(block)
+        if len(self.start) == 1 and not self.single:
+            raise UsageError(
+                f"frames with a pose span less than {_SHORTEST_BLOCK_S:g} s: errors of the poses cannot be told from"
+                " the camera's; record a few seconds"
+            )
 
     @property
     def start_place(self) -> Place:
@@ -237,14 +247,16 @@ class RecordingFit:
         The parameters are the free ones, in natural units, and what each recording has of its own.
         """
         found = []
+        names = tuple(dict.fromkeys((*self.free, *(name for name in self.own if name not in (TURN, "delay")))))
         for r, one in enumerate(self.recorded):
             theta, shift = self.of_recording(place, r)
-            slope = one.model.slopes(theta, (*self.free, *EFFECTS), "ranges", shift=shift)
+            slope = one.model.slopes(theta, (*names, *EFFECTS), "ranges", shift=shift)
             found.append(self.sensor.metres_per_radian * slope.imag)
-        by_free, by_pose = np.split(np.concatenate(found), [len(self.free)], axis=1)
+        by_mounting, by_pose = np.split(np.concatenate(found), [len(names)], axis=1)
+        by_free = by_mounting[:, : len(self.free)]
         by_turn = -by_pose[:, EFFECTS.index("delta_rad")] - by_pose[:, EFFECTS.index("bearing_rad")]
         by_name = {TURN: by_turn, "delay": by_pose[:, EFFECTS.index("time_s")]}
-        by_own = [by_name[name] if name in by_name else by_free[:, self.free.index(name)] for name in self.own]
+        by_own = [by_name[name] if name in by_name else by_mounting[:, names.index(name)] for name in self.own]
         parts = [
             np.where((self.recording == r)[:, None], one, 0.0)[:, None]
             for r in range(len(self.recorded))
@@ -435,8 +447,7 @@ class RecordingFit:
 
     def usual_sizes(self, frame: float, block: float) -> Sizes:
         """Return sizes of errors before a frame is seen; of poses some of their units."""
-        usual = RecordingSizes.usual(self.own, len(self.recorded))
-        return Sizes(np.full(len(EFFECTS), frame), np.full(len(EFFECTS), block), usual)
+        return Sizes(np.full(len(EFFECTS), frame), np.full(len(EFFECTS), block), self.usual_own)
 
     def misfit(self, place: Place) -> tuple[float, int]:
         """Return the mean square of the residuals of all candidates, each at most 5 cm, m², and their number."""
@@ -520,7 +531,7 @@ class RecordingFit:
             pose_chi2=np.where(use, (beside / std) ** 2, 0.0).sum(axis=1),
             held_out_m=(rms(before[judged]), rms(held_out[judged])),
             edges=self.edges,
-            notes=tuple(sentences.recording_notes(use, left_out, systematic)),
+            notes=tuple(sentences.recording_notes(use, left_out, systematic, in_file=self.zones)),
             left_out=left_out,
             frames_left_out=float(frames_out.mean()) if frames_out.size else 0.0,
             own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),

@@ -45,6 +45,7 @@ def match_frames(
     search: Search,
     place: Place,
     moving: bool = False,
+    delay_ms: Annotated[float | None, Shown(metavar="MS")] = None,
     learn_orientation: bool = False,
     results: Results,
 ) -> None:
@@ -64,6 +65,8 @@ def match_frames(
         Measured frames: CSV, NPY, NPZ or HDF5.
     moving
         The camera moves: match every frame by itself instead of their mean.
+    delay_ms
+        Delay of this recording: added to the stamp of a frame to get the time of its pose; unless stated, the sensor's.
     learn_orientation
         With refine: learn from up to 10 frames how the image is mirrored and turned, then match.
     """
@@ -72,6 +75,9 @@ def match_frames(
     landmarks = place.landmarks()
     results.check()
     search.check()
+    most_ms = 10_000
+    if delay_ms is not None and not abs(delay_ms) <= most_ms:
+        raise UsageError(f"--delay-ms must be from -{most_ms} to {most_ms}, got {delay_ms:g}")
     if learn_orientation:
         _refuse_to_learn(reading, search)
     if search.is_direct:
@@ -86,7 +92,7 @@ def match_frames(
             note_too_far(opened.camera, {"--wall": search.wall})
         plots = results.plots(len(positions))
         refuse_unwritable_files(results.files(plots), results.force)
-        printed = _Answers(search, place, results, landmarks, plots, moving)
+        printed = _Answers(search, place, results, landmarks, plots, moving, delay_ms)
         printed.match_all(matcher, positions)
         printed.note_what_is_open(matcher)
         if results.estimates is not None:
@@ -185,6 +191,7 @@ class _Answers:
     landmarks: LandmarkMap | None
     plots: Mapping[int, Path]
     moving: bool
+    delay_ms: float | None
     answers: list[dict[str, Any]] = field(default_factory=list)
     """All of them only for --json, whose answers are one list."""
     drawn: dict[int, tuple[FilteredFrames, Match]] = field(default_factory=dict)
@@ -213,7 +220,10 @@ class _Answers:
         frames = positions.frames if isinstance(positions, DirectPositions) else positions
         stamps_s = getattr(frames, "time_s", None)
         if stamps_s is not None:
-            self.pose_time_s = pose_times_s(stamps_s, matcher.bank.sensor.delay_s).tolist()
+            delay_s = matcher.bank.sensor.delay_s if self.delay_ms is None else self.delay_ms / 1e3
+            self.pose_time_s = pose_times_s(stamps_s, delay_s).tolist()
+        elif self.delay_ms is not None:
+            raise UsageError("--delay-ms is added to time stamps, and these frames have none")
         self.estimated = EstimateTable(matcher.free, self.pose_time_s)
         at_once = NEAREST_AT_ONCE if matcher.method == "nearest" else REFINED_AT_ONCE
         with LongWork("matching") if n > at_once else nullcontext() as progress:
