@@ -102,7 +102,8 @@ class Matcher:
         None: 1.5°, of reported ranges 3°.
     height_std_m, pitch_std_rad, roll_std_rad : float
         How well height, pitch and roll are known where they are free: standard deviations of Gaussian priors with mean
-        0; infinite where nothing is known. Starts are looked for up to three of them away, within a quarter of the
+        0, or the pitch and roll that frames state; infinite where nothing is known. Where pitch or roll is not free, it
+        is as stated. Starts are looked for up to three of them away, within a quarter of the
         image.
     systematic : collection of {"calibration", "recording", "declared", "motion"}, optional
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
@@ -308,6 +309,8 @@ class Matcher:
                 f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'
             )
         frames = self.read_out(frames).without_offset().with_pooled_noise()
+        if self.method == "nearest" and frames.tilts_rad.any():
+            raise UsageError('frames with a tilt take method="refine": the images of a bank are level')
         if on == "reported":
             frames = frames.with_chip_error()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
@@ -373,10 +376,15 @@ class Matcher:
         Among unknown things nearly all can be left out: what they say counts where they show a landmark.
         """
         answers = list(self._by_evidence[0].match(frames))
+        tilted = np.zeros(len(frames), np.bool_)
+        if isinstance(frames, FilteredFrames):
+            tilted |= frames.tilts_rad.any(axis=1)
         for matcher in self._by_evidence[1:]:
             left = [k for k, answer in enumerate(answers) if not self._explains(answer)]
+            if matcher.options["background"] == "auto":  # walls and floors are told from level frames
+                left = [k for k in left if not tilted[k]]
             if not left:
-                break
+                continue
             again = matcher.match(cast(FilteredFrames, frames)[np.array(left)])
             for k, answer in zip(left, again, strict=True):
                 if answer.class_name is not None or not answer.among_unknown:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
@@ -16,6 +17,9 @@ from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+MOST_TILT_DEG = 45.0
+"""No frame or pose is tilted by more: a larger number is in another unit, or of another angle."""
 
 
 class Flag(IntFlag):
@@ -65,6 +69,9 @@ class Frames:
     time_s : array_like, optional
         Time stamp of each frame in the recorder's clock, seconds; `range_m` without its rows and columns gives the
         shape. Real stamps may repeat or run backwards.
+    tilt_rad : array_like, optional
+        Pitch and roll of what the camera is mounted on (PHYSICS section 9), as an IMU tells them: the shape of `time_s`
+        with an axis of 2 behind it.
     by_frequency : sequence of Frames, optional
         What each of several modulation frequencies measured alone: frames of ``sensor.by_frequency``, with the range
         wrapped at c / 2f of each. :func:`~phasemark.render.unwrapped_frames.unwrap_frames` makes frames from these.
@@ -73,7 +80,7 @@ class Frames:
     ------
     UsageError
         The shapes do not agree with each other or with the sensor, numbers are complex, a valid pixel's amplitude or
-        intensity cannot be, a flag is no :class:`Flag`, or a time stamp is not finite.
+        intensity cannot be, a flag is no :class:`Flag`, a time stamp is not finite, or a tilt is beyond ± 45°.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -95,6 +102,7 @@ class Frames:
         taps_e: ArrayLike | None = None,
         invalid_means: Literal["missing", "no-return"] = "missing",
         time_s: ArrayLike | None = None,
+        tilt_rad: ArrayLike | None = None,
         by_frequency: Sequence[Frames] = (),
     ) -> None:
         given = ranges = real_array("range_m", np.ma.getdata(range_m))
@@ -166,6 +174,21 @@ class Frames:
                 k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
                 raise UsageError(f"'time_s' must be finite, got {times.ravel()[k]} at frame {k}")
             self.time_s = times.reshape(shape[:2])
+        self.tilt_rad: NDArray[np.float64] | None = None
+        """Pitch and roll, (n, frames, 2) radians, or None."""
+        if tilt_rad is not None:
+            tilts = real_array("tilt_rad", tilt_rad)
+            if tilts.shape != (*given.shape[:-2], 2):
+                raise UsageError(f"'tilt_rad' has shape {tilts.shape}, but must have {(*given.shape[:-2], 2)}")
+            wrong = ~(np.abs(tilts) <= math.radians(MOST_TILT_DEG))
+            if wrong.any():
+                k = int(np.flatnonzero(wrong.reshape(-1, 2).any(axis=1))[0])
+                pitch, roll = tilts.reshape(-1, 2)[k]
+                raise UsageError(
+                    f"'tilt_rad' must be within ± {math.radians(MOST_TILT_DEG):.3g} (± {MOST_TILT_DEG:g}°), got pitch"
+                    f" {pitch:g} and roll {roll:g} at frame {k}"
+                )
+            self.tilt_rad = tilts.reshape(*shape[:2], 2)
         self.sensor = sensor
         self._by_frequency = _checked_parts(by_frequency, shape, sensor)
 
@@ -189,7 +212,7 @@ class Frames:
         frames = cls.__new__(cls)
         range_m[flags != 0] = np.nan
         frames.range_m, frames.amplitude_e, frames.intensity_e, frames.flags = range_m, amplitude_e, intensity_e, flags
-        frames.taps_e, frames.time_s, frames.sensor = taps_e, None, sensor
+        frames.taps_e, frames.time_s, frames.tilt_rad, frames.sensor = taps_e, None, None, sensor
         frames._by_frequency = tuple(by_frequency)
         return frames
 
@@ -240,7 +263,13 @@ class Frames:
         """Return frames with `change` made to each array, (n, frames, ...); without taps and stamps if asked for."""
         arrays: dict[str, Any] = {
             name: change(values)
-            for name in ("amplitude_e", "intensity_e", "flags", *(() if ranges_alone else ("taps_e", "time_s")))
+            for name in (
+                "amplitude_e",
+                "intensity_e",
+                "flags",
+                "tilt_rad",
+                *(() if ranges_alone else ("taps_e", "time_s")),
+            )
             if (values := getattr(self, name)) is not None
         }
         cameras = [part.sensor for part in self._by_frequency] if sensor is None else sensor.by_frequency

@@ -61,6 +61,7 @@ def unwrap_frames(parts: Sequence[Frames], sensor: Sensor, *, taps_e: NDArray[np
         flags=_flags(np.stack([part.flags for part in parts]), found.range_m, found.consistent, sensor),
         taps_e=taps_e,
         time_s=first.time_s,
+        tilt_rad=first.tilt_rad,
         by_frequency=parts,
     )
 

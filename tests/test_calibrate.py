@@ -318,6 +318,10 @@ def test_pose_errors_are_those_of_moved_lenses_and_turned_cameras():
         ("distance_m,delta_deg\n1,left\n", "line 2: 'delta_deg' must be a number, got 'left'"),
         ("distance_m,delta_deg\n120,30\n", "line 2: the lens is 120 m from the landmark"),
         ("distance_m,delta_deg\n-1,30\n", "line 2: the lens is -1 m from the landmark"),
+        (
+            "distance_m,delta_deg,pitch_deg\n1,30,0\n1,30,-50\n",
+            "line 3: pitch must be within ± 45° (a positive pitch looks",
+        ),
         ("distance_m,delta_deg,frames\n1,30,2.5\n", "line 2: 'frames' must be a number of frames, got 2.5"),
         ("t_s,t_ms,distance_m,delta_deg\n1,1000,1.0,0\n", "state the same stamps twice"),
     ],
@@ -341,6 +345,10 @@ def test_poses_are_read_with_semicolons_decimal_commas_and_stamps(tmp_path):
     assert poses.where(1).endswith("line 5")
     (tmp_path / "ms.csv").write_text("t_ms,distance_m,delta_deg\n500,1.0,0\n567,1.1,3\n")
     np.testing.assert_allclose(read_poses(tmp_path / "ms.csv").time_s, [0.5, 0.567])
+    assert not read_poses(tmp_path / "ms.csv").are_tilted
+    (tmp_path / "tilted.csv").write_text("distance_m,delta_deg,roll_deg,pitch_deg\n1.0,0,-2,3\n")
+    tilted = read_poses(tmp_path / "tilted.csv")
+    np.testing.assert_allclose([*tilted.pitch_rad, *tilted.roll_rad], [3 * DEGREE, -2 * DEGREE])
     (tmp_path / "s.csv").write_text("x_m,y_m,heading_deg,t_s\n-1,0,0,2.5\n")
     np.testing.assert_allclose(read_poses(tmp_path / "s.csv").time_s, [2.5])
 
@@ -558,25 +566,33 @@ def ride(time_s, phase):
     )
 
 
-def record(rng, mounting, n=40, *, zone=None, turn=0.0):
+def swaying(time_s, phase, tilt):
+    """Return the same with pitch and roll of up to `tilt`, several times a second."""
+    pitch, roll = tilt * np.sin(4.1 * time_s + 3 * phase), tilt * np.sin(2.9 * time_s - phase)
+    return replace(ride(time_s, phase), pitch_rad=pitch, roll_rad=roll)
+
+
+def record(rng, mounting, n=40, *, zone=None, turn=0.0, tilt=0.0):
     """Return a recording at 15 frames/s that reports z, poses at 20 Hz, and the offsets of its zones.
 
-    With `turn` the landmark is turned against the axes of the poses, the heading before it being the same.
+    With `turn` the landmark is turned against the axes of the poses, the heading before it being the same. With `tilt`
+    the camera pitches and rolls by as much, and the poses say so.
     """
     stamps, phase = 10 + np.arange(n) / 15, rng.uniform(0, 6)
     zone = rng.normal(0, 3e-3, (8, 8)) if zone is None else zone
     there = mounting.on(TOF).with_(bearing_offset_deg=0.0, delay_s=0.0, **TOF_NOISE)
-    at = ride(stamps + mounting.delay_s, phase)
-    views = Views(at.distance_m, at.delta_rad - turn, at.bearing_rad - turn + mounting.bearing_rad, at.height_m)
+    at = swaying(stamps + mounting.delay_s, phase, tilt)
+    azimuth = at.bearing_rad - turn + mounting.bearing_rad
+    views = Views(at.distance_m, at.delta_rad - turn, azimuth, at.height_m, at.pitch_rad, at.roll_rad)
     image = Renderer(BOARD, there, albedo=0.8).render_views(views)
     frames = capture(image, there.with_(zone_offset_m=tuple(map(tuple, zone.tolist()))), rng=rng, n_frames=1)
     ranges = frames.range_m * there.axis_cosine() / TOF.axis_cosine()  # made of z with the half angle assumed
     time = np.arange(9.0, 11 + n / 15, 0.05)
-    poses = replace(ride(time, phase), time_s=time)
+    poses = replace(swaying(time, phase, tilt), time_s=time)
     return kalman_filter(Frames(ranges, sensor=TOF, time_s=stamps[:, None])), poses, zone
 
 
-def moved(seed, n=40):
+def moved(seed, n=40, *, tilt=0.0, told=lambda poses: poses):
     """Calibrate a camera with everything wrong at once; return its NEES, what was found and what is true."""
     rng = np.random.default_rng([2027, seed])
     truth = Mounting(
@@ -584,8 +600,8 @@ def moved(seed, n=40):
         22.5 * DEGREE * (1 + 0.02 * rng.standard_normal()), 22.5 * DEGREE, 0.02 * rng.standard_normal(), 0.8,
         rng.uniform(-0.15, 0.15),
     )  # fmt: skip
-    frames, poses, zone = record(rng, truth, n)
-    found = calibrate(BOARD, frames, poses, free=FREE, moving=True)
+    frames, poses, zone = record(rng, truth, n, tilt=tilt)
+    found = calibrate(BOARD, frames, told(poses), free=FREE, moving=True)
     return nees(found, truth), found, truth, zone
 
 
@@ -677,6 +693,34 @@ def test_a_calibration_leaves_its_covariance_in_the_sensor_file(rides, tmp_path)
     assert math.sqrt(sensor.calibration_matrix[k, k]) == pytest.approx(math.degrees(found.std("pitch")), rel=1e-5)
     before, after = found.held_out_m
     assert after < 0.5 * before
+
+
+def test_a_recording_of_a_camera_that_tilts_is_calibrated_by_the_tilt_of_each_pose():
+    value, found, *_ = moved(3, tilt=8 * DEGREE)
+    # χ²(6), 99.9 %; the mounting's own pitch is told as well as by a level camera
+    assert value < stats.chi2.ppf(0.999, 6)
+    assert found.std("pitch") < 0.1 * DEGREE
+    assert not found.doubts
+
+
+@pytest.mark.parametrize(
+    ("factors", "cause"),
+    [
+        ((0, 0), "the camera hardly moves"),
+        ((-1, 1), "pitch of the poses likely has the other sign"),
+        pytest.param((1, -1), "roll of the poses likely has the other sign", marks=pytest.mark.soak),
+        pytest.param((DEGREE, DEGREE), "tilts of the poses are likely radians", marks=pytest.mark.soak),
+    ],
+)
+def test_tilts_that_are_ignored_or_wrong_are_doubted(factors, cause):
+    """Ignored tilts of ±8° hide the delay among what they do to the image."""
+
+    def wrong(poses):
+        return replace(poses, pitch_rad=factors[0] * poses.pitch_rad, roll_rad=factors[1] * poses.roll_rad)
+
+    _, found, *_ = moved(3, tilt=8 * DEGREE, told=wrong)
+    assert found.doubts
+    assert cause in found.cause
 
 
 def test_stamps_that_repeat_are_moved_into_a_gap_and_those_that_run_backwards_left_out():

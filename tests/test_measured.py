@@ -11,7 +11,7 @@ import pytest
 from phasemark import InputFileError, UsageError
 from phasemark.data import read_frames
 from phasemark.data.measured import write_measured
-from phasemark.render import Flag, Sensor, preset
+from phasemark.render import Flag, Frames, Sensor, preset
 
 PMD = preset("pmd-16x16")
 SMALL = Sensor(rows=2, cols=3, half_angle_h_deg=30, half_angle_v_deg=20)
@@ -383,6 +383,36 @@ def test_times_survive_an_import(tmp_path):
     )
     again = read_frames(write_measured(frames, tmp_path / "a.npz"), sensor=SMALL)
     assert again.time_s.tolist() == [[0.01, 0.02]]
+
+
+@pytest.mark.parametrize("kind", ["csv", "npz"])
+def test_the_tilt_of_each_frame_is_read_and_survives_an_import(tmp_path, kind):
+    path = tmp_path / "a.npz"
+    if kind == "csv":
+        lines = ["3,1,2,3,4,5,6,10", "-4,1,2,3,4,5,6,20"]
+        path = csv_file(tmp_path, named("z", lines, "roll_deg,", ",t_ms"))
+    else:
+        np.savez(path, range=np.stack([IMAGE, IMAGE]), roll_deg=np.array([3, -4]))
+    frames = read_frames(path, sensor=SMALL, unit="m", quantity="z" if kind == "csv" else "range")
+    tilt = np.radians([[[0, 3], [0, -4]]])
+    np.testing.assert_allclose(frames.tilt_rad, tilt, rtol=1e-15)
+    assert frames.each_a_position().tilt_rad.shape == (2, 1, 2)
+    assert frames.some_frames(1, 2).tilt_rad.tolist() == tilt[:, 1:].tolist()
+    again = read_frames(write_measured(frames, tmp_path / "b.npz"), sensor=SMALL)
+    np.testing.assert_allclose(again.tilt_rad, tilt, rtol=1e-15)
+
+
+def test_a_tilt_that_cannot_be_is_named(tmp_path):
+    path = csv_file(tmp_path, named("z", ["3,1,2,3,4,5,6", "60,1,2,3,4,5,6"], "pitch_deg,"))
+    with pytest.raises(InputFileError, match=r"line 3: 'pitch_deg' must be within ± 45°.*, got 60$"):
+        read_frames(path, sensor=SMALL, unit="m")
+    np.savez(tmp_path / "a.npz", range=np.stack([IMAGE, IMAGE]), pitch_deg=np.array([3, 50]))
+    with pytest.raises(
+        InputFileError, match=r"'tilt_rad' must be within ± 0.785 \(± 45°\), got pitch 0.87.* at frame 1"
+    ):
+        read_frames(tmp_path / "a.npz", sensor=SMALL, **STATED)
+    with pytest.raises(UsageError, match=r"'tilt_rad' has shape \(2,\), but must have \(1, 2\)"):
+        Frames(np.ones((1, 2, 3)), sensor=SMALL, tilt_rad=[0.1, 0.1])
 
 
 def test_a_long_recording_with_empty_cells_is_read_in_seconds(tmp_path):

@@ -2,6 +2,7 @@
 
 import csv
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,10 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, cramer_rao, kalman_filter, phasor_mean
 from phasemark.matcher.accuracy import TrialSetup, run_trials
+from phasemark.matcher.filters.stamps import with_tilts_when_taken
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.nearest.bank_minima import Upward
-from phasemark.render import Background, Renderer, Views, capture, preset
+from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
 PMD = preset("pmd-16x16")
 PLAN = BankPlan(classes=["cylinder", "cone"], distance_m="0.85:1.25:0.02", delta_deg="0:180:2")
@@ -228,3 +230,58 @@ def test_the_command_frees_pitch_and_roll_and_writes_them(bank, tmp_path, capsys
     ):
         assert main([*match[:5], *wrong]) == 2
         assert words in capsys.readouterr().err
+
+
+def swaying(renderer, n, seed):
+    """Return views of a drone that pitches and rolls by up to 8°, its frames, and those with the tilt of each."""
+    rng = np.random.default_rng(seed)
+    tilt = np.radians(rng.uniform(-8, 8, (n, 2)))
+    views = Views.broadcast(rng.uniform(0.95, 1.15, n), rng.uniform(0, math.pi, n), 0.0, 0.0, *tilt.T)
+    frames = frames_of(renderer, views, seed=seed)
+    return views, frames, replace(frames, tilt_rad=tilt)
+
+
+def test_frames_whose_tilt_is_known_are_matched_at_that_tilt_and_refused_without(bank, renderers):
+    n = 6
+    views, ignored, known = swaying(renderers["cone"], n, 3)
+    matcher = Matcher(bank, "refine", free=VIEW[:2], background="any")
+    matches = matcher.match(known)
+    assert matches.accepted.all()
+    assert set(matches.class_name) == {"cone"}
+    np.testing.assert_array_equal(np.column_stack([matches.pitch_rad, matches.roll_rad]), known.tilt_rad)
+    error = errors(matches, views, VIEW[:2])
+    squares = np.einsum("ni,nij,nj->", error, np.linalg.inv(matches.covariance), error)
+    assert squares < stats.chi2.ppf(1 - 1e-3, 2 * n)
+    assert not Matcher(bank, "refine", free=VIEW[:2]).match(ignored[:2]).accepted.any()
+    # level frames of the same batch are answered as without the others
+    mixed = replace(known, tilt_rad=np.where(np.arange(n)[:, None] < 2, 0.0, known.tilt_rad))
+    alone = matcher.match(ignored[:2])
+    np.testing.assert_array_equal(matcher.match(mixed).distance_m[:2], alone.distance_m)
+
+
+def test_a_tilt_known_to_half_a_degree_is_the_mean_of_the_prior(bank, renderers):
+    views, _, known = swaying(renderers["cone"], 4, 4)
+    off = math.radians(0.5) * np.random.default_rng(5).standard_normal((4, 2))
+    free = (*VIEW[:2], *VIEW[4:])
+    prior: dict[str, Any] = {"pitch_std_rad": math.radians(0.5), "roll_std_rad": math.radians(0.5)}
+    matches = Matcher(bank, "refine", free=free, **prior).match(replace(known, tilt_rad=known.tilt_rad + off))
+    assert matches.accepted.all()
+    error = errors(matches, views, free)
+    squares = np.einsum("ni,nij,nj->", error, np.linalg.inv(matches.covariance), error)
+    assert squares < stats.chi2.ppf(1 - 1e-3, 4 * 4)
+    assert (np.sqrt(matches.covariance[:, 2, 2]) < math.radians(0.5)).all()
+
+
+def test_what_takes_level_frames_refuses_tilted_ones(bank, renderers):
+    _, _, known = swaying(renderers["cone"], 1, 6)
+    for matcher in (Matcher(bank), Matcher(bank, "refine", background=Background(wall_m=3.0))):
+        with pytest.raises(UsageError, match="frames with a tilt take"):
+            matcher.match(known)
+
+
+def test_tilts_of_a_recording_are_those_at_the_time_that_a_frame_shows():
+    stamps, tilt = np.arange(5.0), np.stack([0.1 * np.arange(5), -0.1 * np.arange(5)], axis=1)
+    frames = Frames(np.ones((5, 1, 16, 16)), sensor=PMD, time_s=stamps[:, None], tilt_rad=tilt[:, None])
+    shown = with_tilts_when_taken(frames, -0.5).tilt_rad[:, 0]
+    np.testing.assert_allclose(shown[1:], tilt[1:] - [0.05, -0.05], atol=1e-12)
+    np.testing.assert_array_equal(frames.tilt_rad[:, 0], tilt)

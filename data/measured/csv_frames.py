@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError
-from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, Recording, note_disorder, one_time
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, TILTS, Recording, note_disorder, one_time
+from phasemark.render.frames import MOST_TILT_DEG
 
 _SEPARATORS = (";", "\t", ",")
 _STATED = re.compile(r"\b(unit|quantity)=(\S+)")
@@ -120,12 +121,14 @@ def _parse_named(
             raise InputFileError(f"{place}: has columns {pixels}_0 …, but the first line says {key}={stated[key]}")
         stated[key] = value
 
-    columns = [names.index(time)] if time else []
+    tilts = [name for name in TILTS if name in names]
+    columns = [names.index(name) for name in (*tilts, *([time] if time else []))]
     start = len(columns)
     columns += [column for group in groups.values() for column in group]
     body = _Text(path, lines[1:], separator, len(names), "the columns that the header names", dict(enumerate(names)))
     numbers = _numbers(body, columns)
-    time_s = _times_s(numbers[:, 0], time, body) if time else None
+    time_s = _times_s(numbers[:, len(tilts)], time, body) if time else None
+    tilt_deg = {name: _tilt_deg(numbers[:, k], name, body) for k, name in enumerate(tilts)}
     arrays = {}
     for prefix, group in groups.items():
         name = "range" if prefix in _PIXELS else prefix
@@ -133,7 +136,7 @@ def _parse_named(
         arrays[name] = numbers[:, start : start + len(group)]
         start += len(group)
     _note_ignored(names, columns, path)
-    return Recording(arrays, stated, time_s, flat=True, named=True)
+    return Recording(arrays, stated, time_s, tilt_deg, flat=True, named=True)
 
 
 def _groups(names: list[str], shape: tuple[int, int], place: str, n_frequencies: int) -> dict[str, list[int]]:
@@ -144,7 +147,7 @@ def _groups(names: list[str], shape: tuple[int, int], place: str, n_frequencies:
     found: dict[str, dict[int, int]] = {}
     for column, name in enumerate(names):
         match = _group_of(name)
-        if match is None and name not in SECONDS_PER_TIME_UNIT:
+        if match is None and name not in (*SECONDS_PER_TIME_UNIT, *TILTS):
             continue
         if name in names[:column]:
             raise InputFileError(f"{place}: names the column '{name}' twice")
@@ -181,6 +184,17 @@ def _times_s(values: NDArray[np.float64], name: str, body: _Text) -> NDArray[np.
         )
     note_disorder(values, body.path, lambda k: f"line {body.lines[k][0]}")
     return values * SECONDS_PER_TIME_UNIT[name]
+
+
+def _tilt_deg(values: NDArray[np.float64], name: str, body: _Text) -> NDArray[np.float64]:
+    """Return the pitch or roll of each line; each must have one that is possible."""
+    bad = np.flatnonzero(~(np.abs(values) <= MOST_TILT_DEG))
+    if bad.size:
+        raise InputFileError(
+            f"{body.path}: line {body.lines[bad[0]][0]}: '{name}' must be within ± {MOST_TILT_DEG:g}° (a positive pitch"
+            f" looks down), got {values[bad[0]]:g}"
+        )
+    return values
 
 
 def _note_ignored(names: list[str], used: list[int], path: Path) -> None:

@@ -27,6 +27,7 @@ from phasemark.data.measured.orientation import Orientation
 from phasemark.data.measured.recording import (
     SECONDS,
     SECONDS_PER_TIME_UNIT,
+    TILTS,
     Recording,
     note_disorder,
     one_time,
@@ -46,7 +47,7 @@ QUANTITIES = ("range", "z")
 
 _NUMBERS = ("range", "amplitude", "intensity")
 _OF_FREQUENCY = tuple(f"frequency_{name}" for name in _NUMBERS)
-_COLUMNS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps", *SECONDS_PER_TIME_UNIT)
+_COLUMNS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps", *SECONDS_PER_TIME_UNIT, *TILTS)
 """Arrays of NPZ and HDF5 files that are read."""
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
@@ -131,7 +132,8 @@ def read_frames(
     Returns
     -------
     Frames
-        (n, frames, rows, cols), ranges along the ray, metres; with `time_s` if the file has time stamps.
+        (n, frames, rows, cols), ranges along the ray, metres; with `time_s` if the file has time stamps, and `tilt_rad`
+        if it has ``pitch_deg`` or ``roll_deg``.
 
     Raises
     ------
@@ -175,7 +177,7 @@ def read_frames(
                 " and VL53L8CX)"
             )
         valid &= np.isin(arrays["status"], list(valid_status))
-    time_s = _frame_times_s(raw, valid.shape[:2], path)
+    time_s, tilt_rad = _frame_times_s(raw, valid.shape[:2], path), _frame_tilts_rad(raw, valid.shape[:2], path)
     upright = Orientation(flip_h, rotate)
     arrays = {name: upright.apply(values[..., ::-1, :] if flip_v else values) for name, values in arrays.items()}
     valid = upright.apply(valid[..., ::-1, :] if flip_v else valid)
@@ -192,7 +194,7 @@ def read_frames(
         amplitude, intensity = numbers.get("amplitude"), numbers.get("intensity")
         return Frames(
             range_m, amplitude, intensity, usable, sensor=camera, taps_e=taps, invalid_means=invalid_means,
-            time_s=time_s,
+            time_s=time_s, tilt_rad=tilt_rad,
         )  # fmt: skip
 
     try:
@@ -210,13 +212,22 @@ def read_frames(
 
 def _frame_times_s(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
     """Return the time stamps as (n, frames)."""
-    if raw.time_s is None:
+    return None if raw.time_s is None else _of_each_frame(raw.time_s, "the time stamps", shape, path)
+
+
+def _frame_tilts_rad(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
+    """Return the pitch and roll of each frame, (n, frames, 2), 0 for the one that a file lacks."""
+    if not raw.tilt_deg:
         return None
-    if raw.time_s.size != math.prod(shape) or raw.time_s.shape not in (shape, shape[1:], ()):
-        raise InputFileError(
-            f"{path}: the time stamps must have one number for each frame, shape {shape}, got {raw.time_s.shape}"
-        )
-    return raw.time_s.reshape(shape)
+    each = {name: _of_each_frame(values, f"'{name}'", shape, path) for name, values in raw.tilt_deg.items()}
+    return np.radians(np.stack([each.get(name, np.zeros(shape)) for name in TILTS], axis=-1))
+
+
+def _of_each_frame(values: NDArray[np.float64], what: str, shape: tuple[int, ...], path: Path) -> NDArray[np.float64]:
+    """Return numbers of frames as (n, frames)."""
+    if values.size != math.prod(shape) or values.shape not in (shape, shape[1:], ()):
+        raise InputFileError(f"{path}: {what} must have one number for each frame, shape {shape}, got {values.shape}")
+    return values.reshape(shape)
 
 
 def _range_limit(sensor: Sensor) -> tuple[float, str]:
@@ -357,7 +368,7 @@ def _check_frequencies(stated: NDArray[Any] | None, sensor: Sensor, path: Path) 
 def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool = False) -> Path:
     """Write measured frames as an NPZ file: range along the ray in metres, which :func:`read_frames` reads untold.
 
-    Time stamps go into it as ``t_s``.
+    Time stamps go into it as ``t_s``, tilts as ``pitch_deg`` and ``roll_deg``.
 
     Parameters
     ----------
@@ -392,6 +403,8 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
                 arrays[key] = np.stack(own, axis=2)
     if frames.time_s is not None:
         arrays[SECONDS] = frames.time_s
+    if frames.tilt_rad is not None:
+        arrays |= dict(zip(TILTS, np.moveaxis(np.degrees(frames.tilt_rad), -1, 0), strict=True))
     buffer = io.BytesIO()
     np.savez(buffer, **arrays, unit="m", quantity="range")
     return write_atomically(path, buffer.getvalue(), force=force)
@@ -579,13 +592,19 @@ def _of_arrays(file: Mapping[str, Any], names: Iterable[str], stated: Mapping[st
     arrays = {name: np.asarray(file[name][...]) for name in names}
     name = one_time(arrays, path)
     time_s = None if name is None else _times_s(arrays.pop(name), name, path)
-    return Recording(arrays, stated, time_s)
+    tilt_deg = {name: _real(arrays.pop(name), name, path) for name in TILTS if name in arrays}
+    return Recording(arrays, stated, time_s, tilt_deg)
+
+
+def _real(values: NDArray[Any], name: str, path: Path) -> NDArray[np.float64]:
+    """Return an array as float64; refuse one that holds no real numbers."""
+    if values.dtype.kind not in "fiu":
+        raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
+    return values.astype(np.float64)
 
 
 def _times_s(values: NDArray[Any], name: str, path: Path) -> NDArray[np.float64]:
-    if values.dtype.kind not in "fiu":
-        raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
-    times = values.astype(np.float64)
+    times = _real(values, name, path)
     if not np.isfinite(times).all():
         k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
         raise InputFileError(f"{path}: frame {k} has no time: '{name}' must be finite, got {times.ravel()[k]}")

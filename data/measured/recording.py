@@ -18,6 +18,8 @@ from phasemark.data.files.guard import EXPANSION, FREE_BYTES
 MILLISECONDS, SECONDS = "t_ms", "t_s"
 SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
 """Names of time stamps, in CSV columns and in arrays, with the length of their unit."""
+TILTS = ("pitch_deg", "roll_deg")
+"""Names of the tilt of each frame, in CSV columns and in arrays."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,8 @@ class Recording:
         "unit" and "quantity", where the file states them.
     time_s : array of float64, optional
         Time stamps, seconds.
+    tilt_deg : mapping of str to array of float64
+        Of :data:`TILTS` those that the file has; a number for each frame.
     flat : bool
         Whether frames are rows of rows · cols values.
     named : bool
@@ -43,6 +47,7 @@ class Recording:
     arrays: Mapping[str, NDArray[Any]]
     stated: Mapping[str, str] = field(default_factory=dict)
     time_s: NDArray[np.float64] | None = None
+    tilt_deg: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
     flat: bool = False
     named: bool = False
     valid_status: tuple[int, ...] | None = None

@@ -12,6 +12,7 @@ from dataclasses import replace
 from functools import partial
 from typing import get_args
 
+import numpy as np
 import trimesh
 
 from phasemark import UsageError
@@ -65,7 +66,8 @@ def calibrate(
         :func:`~phasemark.matcher.phasor_mean`. Of a moving camera several recordings may be given: each then has small
         errors of its own in range offset, bearing, pitch, roll and delay, whose sizes are estimated too.
     poses : KnownPoses or sequence of KnownPoses
-        Known poses of the camera; of several recordings in their order.
+        Known poses of the camera; of several recordings in their order. Where they state no tilt, it is that of the
+        frames.
     free : sequence of str, optional
         What to estimate: :data:`NAMES`, and of a sensor with a lens fx, fy, cx, cy and the coefficients that it states
         (all of them: ``lens``) in place of half angles. None: all of it but the lens. On ranges the albedo is told only
@@ -170,7 +172,20 @@ def _recordings(
     for k, one in enumerate(measured[1:], 2):
         if one.sensor != measured[0].sensor:
             raise UsageError(f"recording {k} is of another sensor than the first")
-    return list(zip(measured, known, strict=True))
+    return [(own, _tilted(poses, own, moving)) for own, poses in zip(measured, known, strict=True)]
+
+
+def _tilted(poses: KnownPoses, frames: FilteredFrames, moving: bool) -> KnownPoses:
+    """Return poses that state no tilt with that of their frames, if these state one."""
+    tilt_rad = frames.tilt_rad
+    if tilt_rad is None or poses.are_tilted:
+        return poses
+    if moving and frames.time_s is not None and poses.time_s is not None:
+        known, first = np.unique(frames.time_s, return_index=True)
+        tilt_rad = np.stack([np.interp(poses.time_s, known, own[first]) for own in tilt_rad.T], axis=1)
+    if len(tilt_rad) != len(poses):  # refused elsewhere
+        return poses
+    return replace(poses, pitch_rad=tilt_rad[:, 0].copy(), roll_rad=tilt_rad[:, 1].copy())
 
 
 def _quantity(frames: FilteredFrames, on: Explained, recorded: bool) -> ResidualKind:

@@ -17,6 +17,7 @@ from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, clippe
 from phasemark.matcher.calibration.mounting_model import natural_units
 from phasemark.matcher.calibration.problem import Problem, Solution
 from phasemark.matcher.calibration.recording_fit import RecordingFit
+from phasemark.render.frames import MOST_TILT_DEG
 
 _Change = Callable[[Problem], Problem]
 TRUSTED = 3.0
@@ -85,6 +86,9 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
             f"frames and poses disagree by {1e3 * distance:.2g} mm in distance and {math.degrees(delta):.2g}° in δ"
             " (r.m.s.)"
         )
+    if (solution.tilt_std_rad > wander_rad).any():
+        pitch, roll = np.degrees(solution.tilt_std_rad)
+        doubts.append(f"frames and the tilts of their poses disagree by {pitch:.2g}° in pitch and {roll:.2g}° in roll")
     if "delay" not in problem.names:
         fixed = RecordingFit(problem, edges=solution.edges)
         freed = RecordingFit(problem.changed(_with_delay), edges=solution.edges)
@@ -229,6 +233,14 @@ def _posed(problem: Problem, x: float = 1.0, y: float = 1.0, heading: float = 1.
     return replace(problem, poses=replace(poses, delta_rad=azimuth, bearing_rad=bearing))
 
 
+def _tilted(problem: Problem, pitch: float = 1.0, roll: float = 1.0) -> Problem:
+    """Return a problem with the tilts of its poses multiplied."""
+    poses = problem.poses
+    tilts = {name: by * getattr(poses, name) for name, by in (("pitch_rad", pitch), ("roll_rad", roll))}
+    most = math.radians(MOST_TILT_DEG)
+    return replace(problem, poses=replace(poses, **{name: np.clip(own, -most, most) for name, own in tilts.items()}))
+
+
 def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
     """Return problems that differ from the stated one in one value, each with what would then be right."""
     changes: list[tuple[_Change, str]] = [
@@ -241,6 +253,16 @@ def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
         (partial(_posed, heading=math.degrees(1)), "headings of the poses are likely radians: heading_deg is degrees"),
         (_flipped, "images are likely mirrored: give flip_h=True"),
     ]
+    if any(one.poses.are_tilted for one in stated.recordings):
+        sign = "of the poses likely has the other sign: a positive"
+        changes += [
+            (partial(_tilted, pitch=-1), f"pitch {sign} one looks down"),
+            (partial(_tilted, roll=-1), f"roll {sign} one lowers the right side"),
+            (
+                partial(_tilted, pitch=math.degrees(1), roll=math.degrees(1)),
+                "tilts of the poses are likely radians: pitch_deg and roll_deg are degrees",
+            ),
+        ]
     if not stated.moving:
         order = np.arange(len(stated.poses))
         changes += [

@@ -15,16 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.inputs import read_text
 from phasemark.inputs.table_cells import cells_of, finite_number
-from phasemark.render.view import wrap_delta_rad
+from phasemark.render.frames import MOST_TILT_DEG
+from phasemark.render.view import VIEW_FIELDS, wrap_delta_rad
 
 POLAR = ("distance_m", "delta_deg")
 CARTESIAN = ("x_m", "y_m", "heading_deg")
 TIMES = {"t_s": 1.0, "t_ms": 1e-3}
 """Columns of time stamps, with their unit in seconds."""
-OPTIONAL = ("height_m", "wall_m", "frames", *TIMES)
+OPTIONAL = ("height_m", "pitch_deg", "roll_deg", "wall_m", "frames", *TIMES)
 COLUMNS = (
     "either distance_m,delta_deg (and bearing_deg if the camera does not point at the landmark's axis) or"
-    " x_m,y_m,heading_deg of the lens; optional height_m, wall_m, frames, t_s or t_ms"
+    " x_m,y_m,heading_deg of the lens; optional height_m, pitch_deg, roll_deg, wall_m, frames, t_s or t_ms"
 )
 """What a file of poses may have, in words."""
 POSE_UNITS = (("distance_mm", 1e3), ("delta_deg", math.degrees(1)), ("bearing_deg", math.degrees(1)))
@@ -41,6 +42,8 @@ class KnownPoses:
     ----------
     distance_m, delta_rad, bearing_rad, height_m : (K,) float64
         The view as measured, before the mounting's own bearing and height are added.
+    pitch_rad, roll_rad : (K,) float64, optional
+        Tilt of what the camera is mounted on, outside the mounting's own (PHYSICS section 9). None: level.
     wall_m : (K,) float64, optional
         Distance of a wall behind the landmark from the lens.
     frames : (K,) int64, optional
@@ -55,6 +58,8 @@ class KnownPoses:
     delta_rad: NDArray[np.float64]
     bearing_rad: NDArray[np.float64]
     height_m: NDArray[np.float64]
+    pitch_rad: NDArray[np.float64] = None  # type: ignore[assignment]
+    roll_rad: NDArray[np.float64] = None  # type: ignore[assignment]
     wall_m: NDArray[np.float64] | None = None
     frames: NDArray[np.int64] | None = None
     place: tuple[str, ...] = ()
@@ -62,7 +67,10 @@ class KnownPoses:
 
     def __post_init__(self) -> None:
         n = len(self.distance_m)
-        for name in ("distance_m", "delta_rad", "bearing_rad", "height_m", "wall_m", "time_s"):
+        for name in VIEW_FIELDS[4:]:
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, np.zeros(n))
+        for name in (*VIEW_FIELDS, "wall_m", "time_s"):
             values = getattr(self, name)
             if values is None:
                 continue
@@ -74,6 +82,14 @@ class KnownPoses:
         if n and not (self.distance_m > 0).all():
             k = int(self.distance_m.argmin())
             raise UsageError(f"{self.where(k)}: 'distance_m' must be positive, got {self.distance_m[k]:g}")
+        for name in VIEW_FIELDS[4:]:
+            tilt_deg = np.degrees(getattr(self, name))
+            if n and np.abs(tilt_deg).max() > MOST_TILT_DEG:
+                k = int(np.abs(tilt_deg).argmax())
+                raise UsageError(
+                    f"{self.where(k)}: {name.removesuffix('_rad')} must be within ± {MOST_TILT_DEG:g}° (a positive"
+                    f" pitch looks down), got {tilt_deg[k]:g}°"
+                )
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -98,9 +114,22 @@ class KnownPoses:
                 joined[name] = None if any(one is None for one in values) else np.concatenate(values)
         return cls(**joined)
 
+    @property
+    def are_tilted(self) -> bool:
+        """Whether any pose has a pitch or a roll."""
+        return bool(self.pitch_rad.any() or self.roll_rad.any())
+
     def where(self, k: int) -> str:
         """Name one pose in a message."""
         return self.place[k] if self.place else f"pose {k}"
+
+    @classmethod
+    def of_views(
+        cls, view: NDArray[np.float64], *, place: tuple[str, ...] = (), time_s: NDArray[np.float64] | None = None
+    ) -> KnownPoses:
+        """Take whole views, (K, 6)."""
+        columns = dict(zip(VIEW_FIELDS, np.ascontiguousarray(view.T), strict=True))
+        return cls(**columns, place=place, time_s=time_s)
 
     @classmethod
     def polar(
@@ -196,8 +225,9 @@ def read_poses(
     path : path-like
         Columns ``distance_m`` and ``delta_deg``, optionally ``bearing_deg``; or ``x_m``, ``y_m`` and ``heading_deg`` of
         the lens. In both cases optionally ``height_m`` (of the landmark above where it usually stands), ``wall_m``,
-        ``frames``, and ``t_s`` or ``t_ms``, the time stamp in the clock of the frames. Lines that start with ``#`` and
-        empty ones are skipped.
+        ``frames``, ``t_s`` or ``t_ms``, the time stamp in the clock of the frames, and ``pitch_deg`` and ``roll_deg``,
+        the tilt of what the camera is mounted on (a positive pitch looks down). Lines that start with ``#`` and empty
+        ones are skipped.
     landmark_xy_m : (float, float)
         Where the landmark stands on the map, for the second form.
     landmark_yaw_rad : float
@@ -257,14 +287,20 @@ def read_poses(
             landmark_xy_m=landmark_xy_m,
             landmark_yaw_rad=landmark_yaw_rad,
         )
-    return replace(
-        poses,
-        height_m=values.get("height_m", poses.height_m),
-        wall_m=values.get("wall_m"),
-        frames=values["frames"].astype(np.int64) if "frames" in values else None,
-        place=tuple(where for where, _ in table),
-        time_s=next((scale * values[name] for name, scale in TIMES.items() if name in values), None),
-    )
+    none = np.zeros(len(table))
+    try:
+        return replace(
+            poses,
+            height_m=values.get("height_m", poses.height_m),
+            pitch_rad=np.radians(values.get("pitch_deg", none)),
+            roll_rad=np.radians(values.get("roll_deg", none)),
+            wall_m=values.get("wall_m"),
+            frames=values["frames"].astype(np.int64) if "frames" in values else None,
+            place=tuple(where for where, _ in table),
+            time_s=next((scale * values[name] for name, scale in TIMES.items() if name in values), None),
+        )
+    except UsageError as error:  # an angle that cannot be
+        raise InputFileError(str(error)) from None
 
 
 def _check_header(path: Path, names: list[str]) -> bool:

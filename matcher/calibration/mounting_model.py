@@ -28,6 +28,7 @@ from phasemark.render.sensor.lens_fields import TERMS
 from phasemark.render.sensor.lens_map import distort
 from phasemark.render.sensor.lens_rates import lens_rates
 from phasemark.render.threads import mapped
+from phasemark.render.view import VIEW_FIELDS
 
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
@@ -36,8 +37,10 @@ STEP = 2e-4
 passes a corner of a pixel, narrow enough to be the slope."""
 POSE = ("distance_m", "delta_rad", "bearing_rad", "height_m")
 """What of a pose may be uncertain."""
-EFFECTS = (*POSE, "time_s")
-"""Errors of a pose and of its stamp, by which slopes can be taken beside the parameters of the mounting."""
+EFFECTS = (*POSE, "time_s", "pitch_rad", "roll_rad")
+"""Errors of a pose, its stamp and its tilt, by which slopes can be taken beside the parameters of the mounting."""
+LEVEL_EFFECTS = EFFECTS[:5]
+"""Those of poses that state no tilt."""
 _ALIKE = {"bearing_rad": "bearing", "height_m": "height"}
 """Errors of a pose that move an image as a parameter does: one slope serves both, and they cancel where they should."""
 _TERM_UNIT = math.tan(math.radians(1.0))
@@ -267,8 +270,8 @@ class CalibrationModel:
         ----------
         theta : (21,) float64
             The mounting.
-        shift : (K, 4) or (K, 3) float64, optional
-            What is added to the poses, :data:`POSE` or the first three of them.
+        shift : (K, s) float64, optional
+            What is added to the first s numbers of the views of the poses.
         need_alone : bool
             Whether the landmark alone is wanted even where nothing else is made of it.
         """
@@ -321,11 +324,12 @@ class CalibrationModel:
         """
         half = self.step if width is None else np.maximum(width, self.step)
         own = {name: _ALIKE[name] if _ALIKE.get(name) in names else name for name in POSE}
+        moving = VIEW_FIELDS if self.poses.are_tilted else POSE
 
         def difference(name: str) -> NDArray[np.complex128]:
-            if name in POSE:
-                step, span = STEP * np.eye(len(POSE))[POSE.index(name)], 2 * STEP
-                base = np.zeros((len(self.poses), len(POSE)))
+            if name in VIEW_FIELDS:
+                step, span = STEP * np.eye(len(VIEW_FIELDS))[VIEW_FIELDS.index(name)], 2 * STEP
+                base = np.zeros((len(self.poses), len(VIEW_FIELDS)))
                 if shift is not None:
                     base[:, : shift.shape[1]] = shift
                 high, low = self.images(theta, base + step).phasor, self.images(theta, base - step).phasor
@@ -339,13 +343,14 @@ class CalibrationModel:
 
         by_time = {"delay", "time_s"} & set(names)
         exact = {"range_offset", *by_time, *(("albedo",) if on == "phasors" else ())}
-        wanted = dict.fromkeys(own.get(name, name) for name in (*names, *(POSE if by_time else ())))
+        wanted = dict.fromkeys(own.get(name, name) for name in (*names, *(moving if by_time else ())))
         rendered = [name for name in wanted if name not in exact]
         found = dict(zip(rendered, mapped(difference, rendered, self.workers), strict=True))
         found |= {name: found[same] for name, same in own.items() if same in found}
         if by_time:
-            moving = np.einsum("ks,skr->kr", self.poses_at(theta)[1], np.stack([found[name] for name in POSE]))
-            found |= dict.fromkeys(by_time, moving)
+            rate = self.poses_at(theta)[1][:, : len(moving)]
+            by_rate = np.einsum("ks,skr->kr", rate, np.stack([found[name] for name in moving]))
+            found |= dict.fromkeys(by_time, by_rate)
         if on == "ranges":
             found["range_offset"] = np.full(
                 (len(self.poses), self.sensor.rows * self.sensor.cols), 1j / self.sensor.metres_per_radian
@@ -382,10 +387,10 @@ class CalibrationModel:
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
 
     def poses_at(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return :data:`POSE` of each frame and their rates per second, (K, 4) each; the rates are 0 at rest."""
+        """Return the view of each frame and its rates per second, (K, 6) each; the rates are 0 at rest."""
         if self._track is not None and self._stamp_s is not None:
             return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])
-        still = np.column_stack([getattr(self.poses, name) for name in POSE])
+        still = np.column_stack([getattr(self.poses, name) for name in VIEW_FIELDS])
         return still, np.zeros_like(still)
 
     def _views(self, theta: NDArray[np.float64], shift: NDArray[np.float64] | None) -> Views:

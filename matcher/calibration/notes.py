@@ -180,8 +180,8 @@ def recording_notes(
     use : (K, pixels) bool
     left_out : float
         Share of the pixels that disagreed.
-    systematic : (5,) float64
-        Standard deviations of pose errors: distance, δ, bearing, height, time.
+    systematic : (5,) or (7,) float64
+        Standard deviations of pose errors: distance, δ, bearing, height, time; pitch and roll of poses that state them.
     in_file : bool
         Whether they become those of the sensor file.
     """
@@ -194,11 +194,17 @@ def recording_notes(
     if median <= few:
         notes.append(f"Half of the frames count by {median} pixels or fewer: their errors are those of the result.")
     texts = ("{:.2g} mm in distance", "{:.2g}° in δ", "{:.2g}° in bearing", "{:.2g} mm in height", "{:.2g} ms in time")
-    shown = systematic * [1e3, math.degrees(1), math.degrees(1), 1e3, 1e3]
+    level, tilt = np.split(systematic, [len(texts)])
+    shown = level * [1e3, math.degrees(1), math.degrees(1), 1e3, 1e3]
     parts = [text.format(size) for text, size in zip(texts, shown, strict=True) if size > 0]
     if parts:
         notes.append(
             f"Beyond noise, poses and ranges disagree by {', '.join(parts)} (standard deviations)"
             f"{': systematic errors of the sensor file' if in_file else ''}."
+        )
+    if tilt.any():
+        pitch, roll = np.degrees(tilt)
+        notes.append(
+            f"The tilts stated are off by {pitch:.2g}° in pitch and {roll:.2g}° in roll (standard deviations)."
         )
     return notes

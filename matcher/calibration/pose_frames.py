@@ -93,7 +93,7 @@ def filter_poses(frames: Sequence[Frames], on: Explained = "auto") -> FilteredFr
     ]
 
     joined: dict[str, Any] = {}
-    for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective", "time_s"):
+    for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective", "time_s", "tilt_rad"):
         arrays = [getattr(part, name) for part in parts]
         joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
     scattered = any(part.std_from_scatter for part in parts)

@@ -17,6 +17,7 @@ from scipy import interpolate
 from phasemark import UsageError
 from phasemark.matcher.calibration.known_poses import KnownPoses
 from phasemark.matcher.filters.stamps import stamp_jitter
+from phasemark.render.view import VIEW_FIELDS
 
 LONGEST_GAP_S = 0.25
 """Longest time between two poses that is bridged."""
@@ -30,24 +31,24 @@ _FEWEST = 4
 
 @dataclass(frozen=True, eq=False)
 class PoseTrack:
-    """Distance, δ, bearing and height of a moving camera by time.
+    """Views of a moving camera by time.
 
     Parameters
     ----------
     pieces : tuple of (start_s, end_s, spline)
-        Stretches of time without gaps; each spline gives (..., 4) metres and radians.
+        Stretches of time without gaps; each spline gives (..., 6) metres and radians.
     dropped : int
         Number of poses left out because their stamp repeats or runs backwards.
     jitter_s : float
         How far stamps are at least uncertain, standard deviation: 0 where none repeats.
-    sign : (4,) float64
+    sign : (6,) float64
         Factors of the splines.
     """
 
     pieces: tuple[tuple[float, float, interpolate.CubicHermiteSpline], ...]
     dropped: int
     jitter_s: float = 0.0
-    sign: NDArray[np.float64] = field(default_factory=lambda: np.ones(4))
+    sign: NDArray[np.float64] = field(default_factory=lambda: np.ones(6))
 
     @classmethod
     def of(cls, poses: KnownPoses) -> PoseTrack:
@@ -68,7 +69,7 @@ class PoseTrack:
         first = np.concatenate([[True], poses.time_s[1:] > np.maximum.accumulate(poses.time_s)[:-1]])
         time = poses.time_s[first]
         values = np.column_stack(
-            [poses.distance_m, np.unwrap(poses.delta_rad), np.unwrap(poses.bearing_rad), poses.height_m]
+            [np.unwrap(getattr(poses, name)) if name.endswith("_rad") else getattr(poses, name) for name in VIEW_FIELDS]
         )[first]
         ends = np.flatnonzero(np.diff(time) > LONGEST_GAP_S) + 1
         parts = np.split(np.arange(len(time)), ends)
@@ -81,8 +82,8 @@ class PoseTrack:
         return cls(tuple(pieces), int((~first).sum()), stamp_jitter(poses.time_s))
 
     def mirrored(self) -> PoseTrack:
-        """Return the track with the other sign of δ and bearing."""
-        return replace(self, sign=self.sign * np.array([1.0, -1.0, -1.0, 1.0]))
+        """Return the track with the other sign of δ, bearing and roll."""
+        return replace(self, sign=self.sign * np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0]))
 
     def known(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return True where a stretch of time lies between two gaps, (n,)."""
@@ -99,14 +100,14 @@ class PoseTrack:
 
         Returns
         -------
-        value, rate : (n, 4) float64
-            Distance, δ, bearing, height; metres and radians, and per second.
+        value, rate : (n, 6) float64
+            Distance, δ, bearing, height, pitch, roll; metres and radians, and per second.
         """
         starts = np.array([start for start, _, _ in self.pieces])
         stops = np.array([end for _, end, _ in self.pieces])
         away = np.maximum(np.maximum(starts - time_s[:, None], time_s[:, None] - stops), 0.0)
         piece = away.argmin(axis=1)
-        value, rate = np.empty((len(time_s), 4)), np.empty((len(time_s), 4))
+        value, rate = np.empty((len(time_s), 6)), np.empty((len(time_s), 6))
         for k, (start, end, spline) in enumerate(self.pieces):
             own = piece == k
             if own.any():

@@ -127,9 +127,8 @@ class Problem:
         if self.track is None or self.frames.time_s is None:
             return self.poses
         times = self.frames.time_s + delay_s
-        distance, delta, bearing, height = np.ascontiguousarray(self.track.at(times)[0].T)
         place = tuple(f"pose at {time:.3f} s" for time in times)
-        return KnownPoses(distance, delta, bearing, height, place=place, time_s=times)
+        return KnownPoses.of_views(self.track.at(times)[0], place=place, time_s=times)
 
     def by_time(self, most_frames: int = MOST_FRAMES) -> tuple[Problem, list[str]]:
         """Return the problem with poses by time and the frames that have one, and notes on what was left out."""
@@ -216,6 +215,8 @@ class Solution(Fitted):
         Share of the frames of which more than half of the pixels that see the landmark have no weight.
     sensor_fields : mapping of str to value
         Fields of the sensor that were estimated beside the mounting.
+    tilt_std_rad : (2,) float64
+        By how much the tilts stated are off, pitch and roll.
     """
 
     problem: Problem
@@ -224,6 +225,7 @@ class Solution(Fitted):
     edges: bool
     frames_left_out: float = 0.0
     sensor_fields: Mapping[str, object] = field(default_factory=dict)
+    tilt_std_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 
 
 def in_image(values: NDArray[np.float64], use: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float64]:

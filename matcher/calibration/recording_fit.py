@@ -5,12 +5,13 @@ The ranges y of frame k are modelled as
     y = f(pose at stamp + delay, mounting + u_r) + zone offsets + S (e_k + e_b) + n
 
 with what its recording has of its own u_r (:mod:`phasemark.matcher.calibration.recording_effects`), the slopes S of the
-ranges by distance, δ, bearing, height and time, an error e_k of the pose of each frame, an error e_b common to each
-block of time, and the noise n of pixels. Mounting, u_r and zone offsets are found by Gauss–Newton
-under the covariance of the rest, with weak priors on the mounting. The sizes of e_k, e_b and of the zone offsets are
-those of the greatest restricted likelihood (:mod:`phasemark.matcher.estimate.variances`); the noise law is fitted to
-the squares of the residuals. So errors that vary slowly widen the covariance instead of being divided by √N. Where
-results without one block of time each scatter more than that says, the covariance is widened by as much.
+ranges by distance, δ, bearing, height and time (of poses that state a tilt by pitch and roll too), an error e_k of the
+pose of each frame, an error e_b common to each block of time, and the noise n of pixels. Mounting, u_r and zone offsets
+are found by Gauss–Newton under the covariance of the rest, with weak priors on the mounting. The sizes of e_k, e_b and
+of the zone offsets are those of the greatest restricted likelihood (:mod:`phasemark.matcher.estimate.variances`); the
+noise law is fitted to the squares of the residuals. So errors that vary slowly widen the covariance instead of being
+divided by √N. Where results without one block of time each scatter more than that says, the covariance is widened by as
+much.
 
 Only pixels that the model says see nothing but the landmark have weight, and of these only those whose residual is
 within a few standard deviations: a floor, a wall or an edge does not enter.
@@ -30,7 +31,13 @@ from phasemark import UsageError
 from phasemark.matcher.calibration import notes as sentences
 from phasemark.matcher.calibration.checks import check_enough, check_poses, check_ranges, check_view, returns_beside
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, columns_of, prior_std
-from phasemark.matcher.calibration.mounting_model import EFFECTS, CalibrationModel, Images, range_residual
+from phasemark.matcher.calibration.mounting_model import (
+    EFFECTS,
+    LEVEL_EFFECTS,
+    CalibrationModel,
+    Images,
+    range_residual,
+)
 from phasemark.matcher.calibration.problem import MOST_FRAMES, Problem, Solution, in_image, rms
 from phasemark.matcher.calibration.recording_effects import TURN, RecordingSizes, stated_apart
 from phasemark.matcher.estimate.variances import RandomEffects
@@ -47,8 +54,8 @@ _Noise = tuple[float, float, float]
 _BLOCK_S, _BLOCKS, _SHORTEST_BLOCK_S = 2.0, 20, 0.5
 """Length of a block of time, seconds, the number of blocks that a short recording is cut into, and their length."""
 _ZONE_UNIT_M = 1e-3
-_UNIT = np.array([1e-3, math.radians(0.1), math.radians(0.1), 1e-3, 5e-3])
-"""Units of the errors of poses: 1 mm, 0.1°, 0.1°, 1 mm, and 5 ms of time."""
+_UNIT = np.array([1e-3, math.radians(0.1), math.radians(0.1), 1e-3, 5e-3, math.radians(0.1), math.radians(0.1)])
+"""Units of :data:`EFFECTS`: 1 mm, 0.1°, 0.1°, 1 mm, 5 ms of time, and 0.1° of pitch and roll."""
 _SIZE_BOUNDS, _ZONE_BOUNDS = (0.02, 100.0), (0.02, 50.0)
 """Of the sizes of errors of poses and of zone offsets, in their units."""
 _APPROACH, _FEWEST_ROUNDS, _MOST_ROUNDS, _STEPS = 8, 3, 8, 3
@@ -140,9 +147,9 @@ class Sizes:
 
     Parameters
     ----------
-    frame, block : (5,) float64
-        Of pose errors of frames and of blocks of time: distance, δ, bearing, height, and time (jitter of the stamps);
-        in their units.
+    frame, block : (s,) float64
+        Of pose errors of frames and of blocks of time: distance, δ, bearing, height, time (jitter of the stamps), and
+        of poses that state a tilt pitch and roll; in their units.
     recording : RecordingSizes
         Of what recordings have of their own.
     zone : float
@@ -156,8 +163,8 @@ class Sizes:
 
     @property
     def variance(self) -> _Float:
-        """Of both pose errors together, (5,); squares of metres, radians, seconds."""
-        return np.asarray((self.frame**2 + self.block**2) * _UNIT**2)
+        """Of both pose errors together, (s,); squares of metres, radians, seconds."""
+        return np.asarray((self.frame**2 + self.block**2) * _UNIT[: len(self.frame)] ** 2)
 
 
 class RecordingFit:
@@ -193,7 +200,9 @@ class RecordingFit:
         moving = problem.track is not None
         self.usual_own = RecordingSizes.of(problem.names, len(self.recorded), moving=moving, stated=apart)
         self.own = self.usual_own.names
-        self.least = np.zeros(len(EFFECTS))
+        tilted = any(one.model.poses.are_tilted for one in self.recorded)
+        self.effects = EFFECTS if tilted else LEVEL_EFFECTS
+        self.unit, self.least = _UNIT[: len(self.effects)], np.zeros(len(self.effects))
         self.least_noise_m = max(_LEAST_NOISE_M, problem.frames.chip_error_m if problem.chip else 0.0)
         self._set_blocks()
 
@@ -205,7 +214,8 @@ class RecordingFit:
             if one.track is not None and stamps is not None:
                 length = min(_BLOCK_S, max(float(stamps[-1] - stamps[0]) / _BLOCKS, _SHORTEST_BLOCK_S))
                 block = np.floor((stamps - stamps[0]) / length).astype(np.int64)
-                self.least[-1] = max(self.least[-1], one.track.jitter_s / _UNIT[-1])  # stamps are so uncertain at least
+                k = self.effects.index("time_s")  # stamps are so uncertain at least
+                self.least[k] = max(self.least[k], one.track.jitter_s / _UNIT[k])
             blocks.append(block + (blocks[-1][-1] + 1 if blocks else 0))
         block = np.concatenate(blocks)
         self.recording = np.repeat(np.arange(len(blocks)), [len(one) for one in blocks])
@@ -242,7 +252,7 @@ class RecordingFit:
         return np.concatenate(residuals) - place.zone, np.concatenate(candidates)
 
     def slopes(self, place: Place) -> tuple[_Float, _Float]:
-        """Return slopes of the ranges by parameters, (K, p + R q, pixels), and by pose errors, (K, 5, pixels).
+        """Return slopes of the ranges by parameters, (K, p + R q, pixels), and by pose errors, (K, s, pixels).
 
         The parameters are the free ones, in natural units, and what each recording has of its own.
         """
@@ -250,7 +260,7 @@ class RecordingFit:
         names = tuple(dict.fromkeys((*self.free, *(name for name in self.own if name not in (TURN, "delay")))))
         for r, one in enumerate(self.recorded):
             theta, shift = self.of_recording(place, r)
-            slope = one.model.slopes(theta, (*names, *EFFECTS), "ranges", shift=shift)
+            slope = one.model.slopes(theta, (*names, *self.effects), "ranges", shift=shift)
             found.append(self.sensor.metres_per_radian * slope.imag)
         by_mounting, by_pose = np.split(np.concatenate(found), [len(names)], axis=1)
         by_free = by_mounting[:, : len(self.free)]
@@ -276,7 +286,7 @@ class RecordingFit:
         weight = np.where(use, 1 / std**2, 0.0)
         r = np.where(use, residual, 0.0)
         j = np.where(use[:, None], slopes[0], 0.0)
-        s = np.where(use[:, None], slopes[1], 0.0) * _UNIT[:, None]
+        s = np.where(use[:, None], slopes[1], 0.0) * self.unit[:, None]
         wj, ws = weight[:, None] * j, weight[:, None] * s
         js, jr = j @ ws.transpose(0, 2, 1), np.einsum("kpr,kr->kp", wj, r)
         jj = np.add.reduceat(j @ wj.transpose(0, 2, 1), self.start, axis=0)
@@ -331,7 +341,7 @@ class RecordingFit:
 
     def sizes(self, linear: RandomEffects, place: Place, start: Sizes) -> Sizes:
         """Return the most likely sizes; one that gains too little likelihood is zero."""
-        effects = len(EFFECTS)
+        effects = len(self.effects)
         own = effects if self.single else 2 * effects
 
         def unpacked(log: _Float, active: _Bool) -> Sizes:
@@ -447,7 +457,8 @@ class RecordingFit:
 
     def usual_sizes(self, frame: float, block: float) -> Sizes:
         """Return sizes of errors before a frame is seen; of poses some of their units."""
-        return Sizes(np.full(len(EFFECTS), frame), np.full(len(EFFECTS), block), self.usual_own)
+        count = len(self.effects)
+        return Sizes(np.full(count, frame), np.full(count, block), self.usual_own)
 
     def misfit(self, place: Place) -> tuple[float, int]:
         """Return the mean square of the residuals of all candidates, each at most 5 cm, m², and their number."""
@@ -481,7 +492,7 @@ class RecordingFit:
                 use = self._gated(residual, seen, slopes[1], std, sizes, None if first else pose_error)
                 linear = self.linear(slopes, residual, use, std)
                 step, covariance = self.step(linear, place, sizes)
-                pose_error = linear.errors(step, sizes.frame, sizes.block) * _UNIT
+                pose_error = linear.errors(step, sizes.frame, sizes.block) * self.unit
                 place = self.moved(place, step)
                 if self.settled(step, covariance, _SETTLED):
                     break
@@ -499,7 +510,7 @@ class RecordingFit:
                 break
         step, covariance = self.step(linear, place, sizes)
         place = self.moved(place, step)
-        pose_error = linear.errors(step, sizes.frame, sizes.block) * _UNIT
+        pose_error = linear.errors(step, sizes.frame, sizes.block) * self.unit
         chi2 = linear.marginal(sizes.frame, sizes.block).quadratic
         after, seen = self.seen(place)
         before = self.seen(self.start_place)[0]
@@ -535,6 +546,7 @@ class RecordingFit:
             left_out=left_out,
             frames_left_out=float(frames_out.mean()) if frames_out.size else 0.0,
             own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),
+            tilt_std_rad=np.append(systematic, [0.0, 0.0])[len(LEVEL_EFFECTS) :][:2],
             sensor_fields=self._sensor_fields(place.zone, noise, systematic, sizes.recording),
         )
 
@@ -570,8 +582,8 @@ class RecordingFit:
     ) -> tuple[_Float, _Float]:
         """Return residuals beside the pose errors, and the share of their variance that fitting these took."""
         count = linear.jr.shape[1]
-        errors = linear.errors(np.zeros(count), sizes.frame, sizes.block) * _UNIT
-        s = np.where(use[:, None], pose, 0.0) * (_UNIT[:, None] / std[:, None])
+        errors = linear.errors(np.zeros(count), sizes.frame, sizes.block) * self.unit
+        s = np.where(use[:, None], pose, 0.0) * (self.unit[:, None] / std[:, None])
         leverage = np.einsum("ksr,kst,ktr->kr", s, linear.error_covariance(np.hypot(sizes.frame, sizes.block)), s)
         left = residual - np.einsum("ks,ksr->kr", errors, pose)
         return left, np.minimum(leverage + count / max(int(use.sum()), 1), 0.9)
@@ -601,7 +613,7 @@ class RecordingFit:
                 if parameter.name in self.free:
                     fields[own] = parameter.in_file * recording.of_another(parameter.name)
         if self.zones:
-            distance, delta, bearing, height, time = systematic.tolist()
+            distance, delta, bearing, height, time = systematic.tolist()[: len(LEVEL_EFFECTS)]
             table = zone.reshape(self.sensor.rows, self.sensor.cols).tolist()
             fields |= {
                 "zone_offset_m": tuple(map(tuple, table)),

@@ -90,7 +90,8 @@ def calibrate_camera(
     frames
         Measured frames: a file for each pose, or one of them all, in order; with --moving recordings.
     poses
-        Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms]; once for each recording.
+        Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms,pitch_deg,roll_deg]; once for each
+        recording.
     out
         The sensor file to write, .toml.
     class_name

@@ -94,10 +94,7 @@ def _truth_of(
     from phasemark.matcher.calibration.pose_track import PoseTrack
 
     assert found.time_s is not None
-    if true.view[:, 4:].any():
-        raise UsageError(f"{truth}: pitch and roll by time are not interpolated: give one true pose for each position")
-    distance, delta, bearing, height = np.ascontiguousarray(true.view[:, :4].T)
-    track = PoseTrack.of(KnownPoses(distance, delta, bearing, height, time_s=true.time_s))
+    track = PoseTrack.of(KnownPoses.of_views(true.view, time_s=true.time_s))
     at = found.time_s + delay_s
     rows = np.flatnonzero(np.isfinite(at) & track.known(at, at))
     if not rows.size:

@@ -66,6 +66,8 @@ class FilteredFrames:
         than predicted from amplitude and intensity: tests then need F, not χ².
     time_s : (n,) float64, optional
         Mean time stamp of the frames at each position, seconds.
+    tilt_rad : (n, 2) float64, optional
+        Mean pitch and roll of what the camera is mounted on (PHYSICS section 9), radians; None: level.
     by_frequency : tuple of FilteredFrames
         What each of several modulation frequencies measured alone, its range wrapped at c / 2f; `range_m` is then
         unwrapped from these, `std_m` is that of the unwrapped range, and amplitude and intensity are those of the first
@@ -86,6 +88,7 @@ class FilteredFrames:
     sensor: Sensor
     std_from_scatter: bool = False
     time_s: NDArray[np.float64] | None = None
+    tilt_rad: NDArray[np.float64] | None = None
     by_frequency: tuple[FilteredFrames, ...] = ()
 
     def __post_init__(self) -> None:
@@ -94,6 +97,13 @@ class FilteredFrames:
             array = getattr(self, name)
             if array is not None and array.shape != shape:
                 raise UsageError(f"'{name}' must have shape (n, rows, cols) = {shape}, got {array.shape}")
+        if self.tilts_rad.shape != (shape[0], 2):
+            raise UsageError(f"'tilt_rad' must have shape (n, 2) = {(shape[0], 2)}, got {self.tilts_rad.shape}")
+
+    @property
+    def tilts_rad(self) -> NDArray[np.float64]:
+        """Pitch and roll of each position, (n, 2); 0 where frames state none."""
+        return np.zeros((len(self), 2)) if self.tilt_rad is None else self.tilt_rad
 
     def __repr__(self) -> str:
         """Describe in one line how many frames there are, and the camera."""
@@ -110,6 +120,7 @@ class FilteredFrames:
         return self.with_arrays(
             lambda array: array[rows],
             time_s=None if self.time_s is None else self.time_s[rows],
+            tilt_rad=None if self.tilt_rad is None else self.tilt_rad[rows],
             by_frequency=tuple(part[index] for part in self.by_frequency),
         )
 

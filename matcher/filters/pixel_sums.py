@@ -149,8 +149,9 @@ def filter_each(frames: Frames, filter_one: Callable[[Frames], FilteredFrames]) 
 
 
 def timed(filtered: FilteredFrames, frames: Frames) -> FilteredFrames:
-    """Give filtered frames the mean time stamp of the frames they were made of."""
-    return filtered if frames.time_s is None else replace(filtered, time_s=frames.time_s.mean(axis=1))
+    """Give filtered frames the mean time stamp and tilt of the frames they were made of."""
+    time_s, tilt_rad = (None if own is None else own.mean(axis=1) for own in (frames.time_s, frames.tilt_rad))
+    return replace(filtered, time_s=time_s, tilt_rad=tilt_rad)
 
 
 def pixels(image: NDArray[_Number]) -> NDArray[_Number]:

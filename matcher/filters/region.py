@@ -81,6 +81,7 @@ def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
         sensor=sensor,
         std_from_scatter=frames.std_from_scatter,
         time_s=frames.time_s,
+        tilt_rad=frames.tilt_rad,
     )
 
 

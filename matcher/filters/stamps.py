@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+from phasemark.render import Frames
 
 
 def stamp_jitter(stamps_s: NDArray[np.float64]) -> float:
@@ -73,3 +76,26 @@ def pose_times_s(stamps_s: NDArray[np.float64], delay_s: float) -> NDArray[np.fl
     moving = stamps_s.shape[1] == 1
     spread = spread_stamps(stamps_s[:, 0])[:, None] if moving else np.stack([spread_stamps(own) for own in stamps_s])
     return np.asarray(spread.mean(axis=1) + delay_s)
+
+
+def with_tilts_when_taken(frames: Frames, delay_s: float) -> Frames:
+    """Return frames of a moving camera with the tilts at the times that their poses belong to.
+
+    A recording states the tilt at the stamp of each frame, which shows the camera where it was at stamp + delay.
+
+    Parameters
+    ----------
+    frames : Frames
+        One frame each, in the order of time; without stamps or tilts they stay as they are.
+    delay_s : float
+        Of the sensor.
+    """
+    if frames.time_s is None or frames.tilt_rad is None:
+        return frames
+    times = pose_times_s(frames.time_s, 0.0)
+    known, first = np.unique(np.maximum.accumulate(times), return_index=True)
+    taken = copy.copy(frames)
+    taken.tilt_rad = np.stack(
+        [np.interp(times + delay_s, known, own[first]) for own in frames.tilt_rad[:, 0].T], axis=-1
+    )[:, None]
+    return taken

@@ -16,6 +16,8 @@ VIEW = VIEW_FIELDS
 """What a view is made of; the columns of arrays of views: D, δ, bearing, height, pitch, roll."""
 LEVEL_VIEW = VIEW[:4]
 """What the view of a level camera is made of."""
+TILT = slice(4, 6)
+"""Columns of pitch and roll."""
 
 
 @dataclass(frozen=True, eq=False)

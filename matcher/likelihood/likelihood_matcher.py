@@ -149,24 +149,39 @@ class LikelihoodMatcher:
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
         match = self._match_auto if self._auto else self._match_stated
-        share = max(math.ceil(len(frames) / self._workers), 1)
-        share = min(share, self._setup.policy.frames_at_once, max(_PIXELS_AT_ONCE // self._setup.used.size, 1))
-        parts = [frames[start : start + share] for start in range(0, len(frames), share)]
-        answers = [answer for some in mapped(match, parts, self._workers) for answer in some]
+        tilted = frames.tilts_rad.any(axis=1)
+        if tilted.any():
+            self._check_tilted()
+        parts = [part for own in (~tilted, tilted) for part in self._parts(np.flatnonzero(own))]
+        found = mapped(match, [frames[part] for part in parts], self._workers)
+        by_frame = {
+            k: answer for part, some in zip(parts, found, strict=True) for k, answer in zip(part, some, strict=True)
+        }
+        answers = [by_frame[k] for k in range(len(frames))]
         if "motion" not in self._systematic:
             return answers
         return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)
 
+    def _parts(self, which: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """Return frames in parts that are matched at once."""
+        share = max(math.ceil(len(which) / self._workers), 1)
+        share = min(share, self._setup.policy.frames_at_once, max(_PIXELS_AT_ONCE // self._setup.used.size, 1))
+        return [which[start : start + share] for start in range(0, len(which), share)]
+
     def _match_stated(self, frames: FilteredFrames) -> list[Match]:
-        """Match frames before the background that was stated, or none."""
+        """Match frames, all of them tilted or none, before the background that was stated, or none."""
         evidence = Evidence.from_frames(frames, self._setup.on)
-        bare = bare_cost(evidence.seen, self._scene.behind)
-        fits = search_views(self._scene, evidence, evidence.seen, bare)
+        scene = self._scene
+        if evidence.tilt_rad.any():  # a bank is of level views: others are rendered
+            search = self._search_of_tilted.tilted(evidence.tilt_rad)
+            scene = replace(scene, final=self._rendered, scout=None, search=search)
+        bare = bare_cost(evidence.seen, scene.behind)
+        fits = search_views(scene, evidence, evidence.seen, bare)
         if self._setup.unknown and not self._setup.reports_one_surface:
-            fits = fit_without_borders(self._scene, evidence, fits)
-        fits = with_profiles(self._scene, evidence, fits)
+            fits = fit_without_borders(scene, evidence, fits)
+        fits = with_profiles(scene, evidence, fits)
         answers = rank(self._setup.rules, fits, self._doubt(fits), bare, [self._stated] * len(frames))
-        answers = self._with_mirror(evidence, answers, self._search)
+        answers = self._with_mirror(evidence, answers, scene.search)
         return self._with_shared_errors(frames, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
@@ -196,7 +211,7 @@ class LikelihoodMatcher:
         left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
         false_alarm = self._setup.rules.false_alarm
         limit = largest_costs(false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
-        found = search.may_explain(seen.mirrored(self._bank.sensor.cols), limit)
+        found = search.of_frames(accepted).may_explain(seen.mirrored(self._bank.sensor.cols), limit)
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))
         return answers
@@ -261,6 +276,14 @@ class LikelihoodMatcher:
         model = BankModel(self._bank)
         return model if is_exact else None, model.smooth(behind) if scouts else None
 
+    def _check_tilted(self) -> None:
+        """Check that tilted frames can be matched."""
+        if self._auto or self._stated is not None:
+            raise UsageError(
+                "frames with a tilt take no wall or floor: leave 'background' out, or give background=\"unknown\""
+            )
+        self._check_distances()
+
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
         nearest, (step_m, step_rad) = self._rendered.limits()[0], _FINE_GRID
@@ -278,24 +301,29 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.rules.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
 
-    def _cells(self, behind: PhasorImages | None, *, open_edges: bool = False) -> CellBounds:
-        """Return the cells of the bank before some background."""
+    def _cells(self, behind: PhasorImages | None, *, open_edges: bool = False, tilted: bool = False) -> CellBounds:
+        """Return the cells of the bank before some background, for level or for tilted frames."""
         setup, bank = self._setup, self._bank
         return CellBounds(
             bank,
             (max(1, round(CELL_M / first_step(bank.distance_m))), max(1, round(CELL_RAD / first_step(bank.delta_rad)))),
             behind,
-            aside=setup.bearing_is_free,
-            upward=not setup.height_and_tilt_are_known,
+            aside=setup.bearing_is_free or tilted,
+            upward=not setup.height_and_tilt_are_known or tilted,
             open_edges=open_edges,
-            turned=self._turned if setup.bearing_is_free else None,
+            turned=self._turned if setup.bearing_is_free or tilted else None,
         )
 
-    def _new_search(self, behind: PhasorImages | None) -> Search:
+    @cached_property
+    def _search_of_tilted(self) -> Search:
+        """The search in frames whose tilt is known, made when it is first needed."""
+        return self._new_search(None, tilted=True)
+
+    def _new_search(self, behind: PhasorImages | None, *, tilted: bool = False) -> Search:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup, layers = self._setup, layers_of(self._bank)
         return Search(
-            self._cells(behind),
+            self._cells(behind, tilted=tilted),
             self._bank.sensor if layers is None else layers.camera,
             layers,
             setup.widest_rad if setup.bearing_is_free else 0.0,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.information import NATURAL_UNITS
-from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
+from phasemark.matcher.likelihood.images import TILT, VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE, counts
@@ -53,8 +53,8 @@ class DescentSettings:
     look_beside_rad : tuple of float
         How far to either side of a solution δ is tried once more; there may be a lower minimum behind a kink.
     prior_std : tuple of float
-        Standard deviation of each free parameter about 0 before the frame was seen; infinite where nothing is known.
-        Empty: nothing is known of any.
+        Standard deviation of each free parameter before the frame was seen, about the tilt that the frame states or 0;
+        infinite where nothing is known. Empty: nothing is known of any.
     returns_behind : (k, pixels) bool, optional
         Where that alone returns light that one frame measures; None without a background.
     unknown_around : bool
@@ -145,7 +145,7 @@ class Problem:
         self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
         self.scale = np.array([SCALE[name] for name in names])
         self.height_or_tilt_is_free = bool(set(names) & set(VIEW[3:]))
-        self.tilts = bool(set(names) & set(VIEW[4:]))
+        self.tilts = bool(set(names) & set(VIEW[TILT]))
         known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
         self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
 
@@ -209,7 +209,13 @@ class Problem:
 
     def prior_cost(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the whitened squared distance of parameters from what was known before, (m,)."""
-        return np.asarray((self.prior_weight * theta[:, self.columns] ** 2).sum(axis=1))
+        return np.asarray((self.prior_weight * self._from_prior(theta) ** 2).sum(axis=1))
+
+    def _from_prior(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far the free parameters are from what was expected of them, (m, p)."""
+        expected = np.zeros((len(theta), ALBEDO_COLUMN + 1))
+        expected[:, TILT] = self.evidence.tilt_rad[self.frame]
+        return np.asarray((theta - expected)[:, self.columns])
 
     def with_prior(self, sums: Sums, theta: NDArray[np.float64]) -> Sums:
         """Add what was known of the parameters before the frame was seen."""
@@ -221,7 +227,7 @@ class Problem:
         return Sums(
             sums.cost + cost,
             sums.capped + cost,
-            sums.gradient - self.prior_weight * theta[:, self.columns],
+            sums.gradient - self.prior_weight * self._from_prior(theta),
             sums.information + square,
         )
 
@@ -309,7 +315,7 @@ class Problem:
         """Move views of some candidates, in place, to distances and tilts that the model can show; return them."""
         self.model.clip(view, which)
         if self.tilts:
-            np.clip(view[:, 4:], -_STEEPEST_RAD, _STEEPEST_RAD, out=view[:, 4:])
+            np.clip(view[:, TILT], -_STEEPEST_RAD, _STEEPEST_RAD, out=view[:, TILT])
         return view
 
 

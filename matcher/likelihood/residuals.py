@@ -51,6 +51,8 @@ class Evidence:
         ν of frames whose noise was estimated from ν + 1 exposures; infinite elsewhere.
     on : {"ranges", "phasors"}
     sensor : Sensor
+    tilt_rad : (n, 2) float64
+        Pitch and roll of each frame before it is seen: of what is not free as it is, else the mean of the prior.
     """
 
     value: NDArray[np.complex128]
@@ -60,6 +62,7 @@ class Evidence:
     scatter_freedom: NDArray[np.float64]
     on: ResidualKind
     sensor: Sensor
+    tilt_rad: NDArray[np.float64]
 
     @classmethod
     def from_frames(cls, frames: FilteredFrames, on: ResidualKind) -> Evidence:
@@ -79,9 +82,9 @@ class Evidence:
         strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
         seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
         turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
-        nu = scatter_freedom(frames)
+        nu, tilt_rad = scatter_freedom(frames), frames.tilts_rad
         if on == "ranges":
-            return cls(turn, whole.weight, one_frame_std_m, seen, nu, on, sensor)
+            return cls(turn, whole.weight, one_frame_std_m, seen, nu, on, sensor, tilt_rad)
         if frames.amplitude_e is None or frames.intensity_e is None:
             raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
         shape = seen.range_m.shape
@@ -90,12 +93,12 @@ class Evidence:
         intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
         variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
         weight = np.where(measured, n_effective / variance, 0.0)
-        return cls(turn * amplitude, weight, one_frame_std_m, seen, nu, on, sensor)
+        return cls(turn * amplitude, weight, one_frame_std_m, seen, nu, on, sensor, tilt_rad)
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
         return Evidence(
             self.value[index], self.weight[index], self.one_frame_std_m[index], self.seen[index],
-            self.scatter_freedom[index], self.on, self.sensor,
+            self.scatter_freedom[index], self.on, self.sensor, self.tilt_rad[index],
         )  # fmt: skip
 
     def with_further_noise(self, std_m: float) -> Evidence:

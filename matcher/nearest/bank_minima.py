@@ -3,6 +3,7 @@
 A bearing moves the image sideways, a height or a pitch up and down. The rays of a turned camera meet the landmark at
 the same ranges, so a frame shifted by whole columns and rows is compared with the bank's images ahead; what is
 shifted in is missing. A return that is shifted out costs 1, the mean of a compared pixel: the bank does not show it.
+A frame whose tilt is known is turned level before: each pixel takes what the frame shows along its ray.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ from phasemark.matcher.nearest.grid import closing_period, first_step
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Sensor
+from phasemark.render.rigid import tilt2level
 from phasemark.render.view import VIEW_FIELDS
 
 _T = TypeVar("_T", bound=np.generic)
@@ -135,6 +137,7 @@ class Search:
     ) -> None:
         self.cells, self._sensor, self._layers = cells, sensor, layers
         self._of_each: Sequence[CellBounds] = ()
+        self._tilt_rad: NDArray[np.float64] | None = None
         self._upward, self._bearing_std_rad = upward, bearing_std_rad
         self.column_rad = sensor.pixel_rad
         most = min(sensor.cols // 4, math.ceil(min(widest_rad / self.column_rad, sensor.cols)))
@@ -157,9 +160,16 @@ class Search:
         other.cells, other._of_each = cells[0], cells[1:] and cells
         return other
 
+    def tilted(self, tilt_rad: NDArray[np.float64]) -> Search:
+        """Return the search in frames of known pitch and roll, (n, 2); its cells span half a pixel to all sides."""
+        other = copy.copy(self)
+        other._tilt_rad = tilt_rad
+        return other
+
     def of_frames(self, frame: NDArray[np.int64]) -> Search:
         """Return the search for some of the frames."""
-        return self.before(*(self._of_each[k] for k in frame)) if self._of_each else self
+        some = self.before(*(self._of_each[k] for k in frame)) if self._of_each else self
+        return some if self._tilt_rad is None else some.tilted(self._tilt_rad[frame])
 
     def cells_of(self, frame: int) -> CellBounds:
         """Return the cells of the bank before what stands behind a frame."""
@@ -187,7 +197,7 @@ class Search:
             if cost_of is not None:
                 cost[[up != 0 for up, _ in self.shifts]] = np.inf
                 self._tell(_least(cost), f, cost_of)
-            found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes]))
+            found.append(self._views(cost, [modes(cost, c, _N_MODES, *self._neighbours) for c in self._classes], f))
         return Starts.joined(found)
 
     def uncovered(
@@ -219,7 +229,7 @@ class Search:
             self._tell(cost, f, cost_of)
             cost[cost > limit[f] + slack] = np.inf
             places = [cover(cost, c, *self._neighbours, *_CLOSE) for c in self._classes]
-            found.append(self._views(cost, places))
+            found.append(self._views(cost, places, f))
         return Starts.joined(found)
 
     def may_explain(self, seen: Observation, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -231,24 +241,26 @@ class Search:
         """Replace the costs of cells that may explain a frame by those of their middles, if these can be told."""
         if cost_of is not None:
             at = b, c, i, j = np.nonzero(np.isfinite(cost))
-            cost[at] = cost_of(f, c, self._middles(b, i, j))
+            cost[at] = cost_of(f, c, self._middles(b, i, j, f))
 
-    def _middles(self, b: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the views in the middles of cells, (k, 6)."""
+    def _middles(self, b: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64], f: int) -> NDArray[np.float64]:
+        """Return the views in the middles of cells at the tilt of a frame, (k, 6)."""
         view = np.zeros((len(b), len(VIEW_FIELDS)))
         view[:, 0], view[:, 1], view[:, 2] = self.cells.distance_m[i], self.cells.delta_rad[j], self._bearing_rad[b]
         for k, shift in enumerate(b):
             view[k, 3:5] = self._upward.split(self._elevation(shift), view[k, 0])
+        if self._tilt_rad is not None:
+            view[:, 4:] += self._tilt_rad[f]
         return view
 
-    def _views(self, cost: NDArray[np.float32], places: Sequence[NDArray[np.int64]]) -> Starts:
+    def _views(self, cost: NDArray[np.float32], places: Sequence[NDArray[np.int64]], f: int) -> Starts:
         """Return the views in some cells of one frame, (k, 3) of each class; best first."""
         places = [own[own[:, 0] >= 0] for own in places]
         c = np.repeat(np.arange(len(places)), [len(own) for own in places])
         b, i, j = np.concatenate(places).T
         costs = cost[b, c, i, j].astype(np.float64)
         order = np.argsort(costs, kind="stable")
-        return Starts(np.zeros(len(order), np.int64), c, self._middles(b, i, j))[order]
+        return Starts(np.zeros(len(order), np.int64), c, self._middles(b, i, j, f))[order]
 
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
@@ -274,16 +286,37 @@ class Search:
         up, side = shift
         if up == 0 and side == 0:
             return seen
-        rows, cols, layers = self._sensor.rows, self._sensor.cols, self._layers
+        rows, cols = self._sensor.rows, self._sensor.cols
+        to_rows, from_rows = slice(max(up, 0), rows + min(up, 0)), slice(max(-up, 0), rows + min(-up, 0))
+        to_cols, from_cols = slice(max(-side, 0), cols + min(-side, 0)), slice(max(side, 0), cols + min(side, 0))
+        return self._moved(seen, (to_rows, to_cols), (from_rows, from_cols))
+
+    def levelled(self, seen: Observation) -> Observation:
+        """Return frames as a level camera would see them: each pixel what a frame shows along its ray."""
+        if self._tilt_rad is None:
+            return seen
+        sensor, parts = self._sensor, []
+        v, u = np.mgrid[: sensor.rows, : sensor.cols]
+        level = sensor.ray_directions(u + 0.5, v + 0.5)
+        for k, turn in enumerate(tilt2level(*self._tilt_rad.T) @ sensor.cam2level):
+            x, y, z = np.moveaxis(level @ turn, -1, 0)
+            ahead = np.maximum(x, 1e-6)
+            at_u, at_v = (np.floor(place).astype(np.int64) for place in sensor.image_points(y / ahead, z / ahead))
+            inside = (x > 0) & (at_u >= 0) & (at_u < sensor.cols) & (at_v >= 0) & (at_v < sensor.rows)
+            there, here = (v[inside], u[inside]), (at_v[inside], at_u[inside])
+            parts.append(self._moved(seen[k : k + 1], there, here))
+        return Observation(*(np.concatenate([getattr(part, name) for part in parts]) for name in vars(seen)))
+
+    def _moved(self, seen: Observation, to: tuple[Any, Any], of: tuple[Any, Any]) -> Observation:
+        """Return frames whose pixels `to` are what was seen in pixels `of`; the others are missing."""
+        cols, layers = self._sensor.cols, self._layers
 
         def move(values: NDArray[_T]) -> NDArray[_T]:
             grid = values.reshape(len(values), values.shape[1] // cols, cols)
             if layers is not None:
                 grid = layers.layers(grid)
             out = np.zeros_like(grid)
-            to_rows, from_rows = slice(max(up, 0), rows + min(up, 0)), slice(max(-up, 0), rows + min(-up, 0))
-            to_cols, from_cols = slice(max(-side, 0), cols + min(-side, 0)), slice(max(side, 0), cols + min(side, 0))
-            out[..., to_rows, to_cols] = grid[..., from_rows, from_cols]
+            out[..., to[0], to[1]] = grid[..., of[0], of[1]]
             return (out if layers is None else layers.stack(out)).reshape(values.shape)
 
         return Observation(move(seen.range_m), move(seen.weight), move(seen.returned), move(seen.not_returned))
@@ -294,8 +327,10 @@ class _Moved:
 
     def __init__(self, search: Search, seen: Observation) -> None:
         self._search = search
-        moved = [search.shifted(seen, shift) for shift in search.shifts]
-        self._lost = [(seen.returned.sum(axis=1) - own.returned.sum(axis=1)).astype(np.float32) for own in moved]
+        level = search.levelled(seen)
+        moved = [search.shifted(level, shift) for shift in search.shifts]
+        count = seen.returned.sum(axis=1)  # turned level, a return may stand in two pixels
+        self._lost = [np.maximum(count - own.returned.sum(axis=1), 0).astype(np.float32) for own in moved]
         each = range(len(seen.returned))
         self._prepared = [[search.cells_of(f).prepared(own[f : f + 1]) for f in each] for own in moved]
 
