@@ -9,41 +9,46 @@ from scipy import special
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 
 
-def scatter_freedom(frames: FilteredFrames) -> NDArray[np.float64]:
-    """Return ν of each frame whose variances were estimated from the scatter of ν + 1 exposures; infinite elsewhere."""
+def noise_tails(frames: FilteredFrames) -> NDArray[np.float64]:
+    """Return what widens the law of χ² of each frame, (n, 2).
+
+    The first is ν where the variances were estimated from the scatter of ν + 1 exposures, infinite elsewhere; the
+    second the `overdispersion` of the sensor where they are those of its noise law.
+    """
     if not frames.std_from_scatter:
-        return np.full(len(frames), np.inf)
+        return np.tile([np.inf, frames.sensor.overdispersion], (len(frames), 1))
     n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
     nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n]) - 1
-    return np.asarray(np.maximum(nu, 5.0))  # the variance of F(1, ν) exists above 4
+    # the variance of F(1, ν) exists above 4
+    return np.column_stack([np.maximum(nu, 5.0), np.zeros(len(nu))])
 
 
 def p_values_of(
-    cost: NDArray[np.float64], dof: NDArray[np.integer] | NDArray[np.float64], nu: NDArray[np.float64]
+    cost: NDArray[np.float64], dof: NDArray[np.integer] | NDArray[np.float64], tails: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the probability of a larger χ² for every fit, (m,); 0 where nothing is left to test.
 
-    Where the variances were estimated from the scatter of ν + 1 frames (`nu`, (m,)), each squared residual follows
-    F(1, ν); their sum is given a scaled χ² of the same mean and variance.
+    `tails`, (m, 2), are those of :func:`noise_tails`. Where variances were estimated from the scatter of ν + 1 frames,
+    each squared residual follows F(1, ν); their sum is given a scaled χ² of the same mean and variance.
     """
-    freedom, scale = _scaled(dof, nu)
+    freedom, scale = _scaled(dof, tails)
     # a cost of 0 is a difference of sums, which may come out a hair below
     return np.asarray(np.where(dof > 0, special.chdtrc(freedom, np.maximum(cost, 0.0) / scale), 0.0))
 
 
-def largest_costs(p: float, dof: NDArray[np.integer], nu: NDArray[np.float64]) -> NDArray[np.float64]:
+def largest_costs(p: float, dof: NDArray[np.integer], tails: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the χ² whose p-value is p for every fit, (m,); arguments as for :func:`p_values_of`."""
-    freedom, scale = _scaled(dof, nu)
+    freedom, scale = _scaled(dof, tails)
     return np.asarray(scale * special.chdtri(freedom, p))
 
 
 def _scaled(
-    dof: NDArray[np.integer] | NDArray[np.float64], nu: NDArray[np.float64]
+    dof: NDArray[np.integer] | NDArray[np.float64], tails: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return degrees of freedom and factor of the scaled χ² of sums of `dof` squared residuals."""
-    n, nu = np.maximum(dof, 1.0), np.minimum(nu, 1e9)
+    n, nu = np.maximum(dof, 1.0), np.minimum(tails[:, 0], 1e9)
     mean = n * nu / (nu - 2)
-    variance = n * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4))
+    variance = n * 2 * nu**2 * (nu - 1) / ((nu - 2) ** 2 * (nu - 4)) * (1 + tails[:, 1])
     return 2 * mean**2 / variance, variance / (2 * mean)
 
 

@@ -24,7 +24,9 @@ from phasemark.matcher.calibration.judgement import likely_cause
 from phasemark.matcher.calibration.mounting import NAMES, PARAMETERS, columns_of
 from phasemark.matcher.calibration.mounting_model import CalibrationModel
 from phasemark.matcher.calibration.pose_track import PoseTrack
+from phasemark.matcher.calibration.recording_fit import overdispersion_of
 from phasemark.matcher.calibration.still_fit import StillFit
+from phasemark.matcher.chi_squared import largest_costs, p_values_of
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -518,7 +520,7 @@ def test_few_poses_take_few_numbers_and_what_is_stated_and_fixed_is_in_the_senso
         ({}, ["--free", "pitch,tilt"], 2, "'free' must be among pitch, roll"),
         ({}, ["--free", "pitch", "--fix", "pitch"], 2, "nothing is free"),
         ({}, ["--on", "ranges", "--free", "albedo"], 2, "takes amplitudes"),
-        ({}, ["--on", "sound"], 2, "'sound' is not one of 'auto', 'ranges', 'phasors'"),
+        ({}, ["--on", "sound"], 2, "'sound' is not one of 'auto', 'ranges', 'reported', 'phasors'"),
         ({}, ["--position-std", "-1"], 2, "'position_m' must be a standard deviation"),
         ({}, ["--albedo", "2"], 2, "--albedo must be in (0, 1]"),
         ({}, ["--class", "cone"], 2, "--class belongs to a bank"),
@@ -608,6 +610,25 @@ def moved(seed, n=40, *, tilt=0.0, told=lambda poses: poses):
 @pytest.fixture(scope="module")
 def rides():
     return [moved(seed) for seed in (1, 2)]
+
+
+def test_frames_whose_noise_varies_are_refused_as_often_as_others():
+    """With noise of variance s, E s = 1 and Var s = v, χ² of n residuals has the variance (1 + v) (2 n + n²) − n²."""
+    rng, v, n = np.random.default_rng(5), 0.05, np.full(4000, 24)
+    normal = rng.chisquare(n)
+    varying = rng.gamma(1 / v, v, len(n)) * rng.chisquare(n)
+    assert overdispersion_of(normal, n) == 0.0
+    expected = ((1 + v) * (2 + 24) - 24) / 2 - 1
+    assert overdispersion_of(varying, n) == pytest.approx(expected, abs=4 * (1 + expected) * math.sqrt(2 / len(n)))
+    refused = {}
+    for stated in (0.0, expected):
+        tails = np.tile([np.inf, stated], (len(n), 1))
+        refused[stated] = (p_values_of(varying, n, tails) < 0.01).sum()
+        # the largest χ² that is not refused
+        assert ((varying > largest_costs(0.01, n, tails)).sum()) == refused[stated]
+    low, high = stats.binom.interval(0.999, len(n), 0.01)
+    assert low < refused[expected] < 1.5 * high  # the law of the sum is but like χ²
+    assert refused[0.0] > 2 * high
 
 
 def part_of_zones(seed, n):

@@ -193,7 +193,7 @@ def test_what_a_chip_reports_is_asked_of_a_sensor_with_a_chip_alone():
 
 def test_a_cost_of_nothing_has_a_p_value():
     """Sums of squares are differences of sums: one of 0 came out as −1e-13, and as no number."""
-    p = p_values_of(np.array([-1e-13, 0.0]), np.array([3.0, 3.0]), np.full(2, np.inf))
+    p = p_values_of(np.array([-1e-13, 0.0]), np.array([3.0, 3.0]), np.tile([np.inf, 0.0], (2, 1)))
     assert p == pytest.approx([1.0, 1.0])
 
 

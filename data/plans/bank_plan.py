@@ -64,6 +64,7 @@ _YOUNGER_FIELDS = {
     "systematic_bearing_deg",
     "systematic_height_m",
     "systematic_time_s",
+    "overdispersion",
     "recording_range_m",
     "recording_pitch_deg",
     "recording_roll_deg",

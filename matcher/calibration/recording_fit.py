@@ -520,6 +520,7 @@ class RecordingFit:
         held_out = self._held_out(at_end, slopes[0], after, place, sizes)
         wider = 1.0 if self.single else self._scatter_of_blocks(at_end, place, sizes, covariance)
         beside = after - np.einsum("ks,ksr->kr", pose_error, self.slopes(place)[1])
+        pose_chi2 = np.where(use, (beside / std) ** 2, 0.0).sum(axis=1)
         left_out = 1 - float((use & seen).sum()) / max(int(seen.sum()), 1)
         few = 3  # pixels of a frame that tell nothing of it
         shown = seen.sum(axis=1)
@@ -539,7 +540,7 @@ class RecordingFit:
             residual_before_m=in_image(before, use, sensor),
             range_std_m=in_image(std, use, sensor),
             pose_shift=pose_error[:, :3],
-            pose_chi2=np.where(use, (beside / std) ** 2, 0.0).sum(axis=1),
+            pose_chi2=pose_chi2,
             held_out_m=(rms(before[judged]), rms(held_out[judged])),
             edges=self.edges,
             notes=tuple(sentences.recording_notes(use, left_out, systematic, in_file=self.zones)),
@@ -547,7 +548,9 @@ class RecordingFit:
             frames_left_out=float(frames_out.mean()) if frames_out.size else 0.0,
             own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),
             tilt_std_rad=np.append(systematic, [0.0, 0.0])[len(LEVEL_EFFECTS) :][:2],
-            sensor_fields=self._sensor_fields(place.zone, noise, systematic, sizes.recording),
+            sensor_fields=self._sensor_fields(
+                place.zone, noise, systematic, sizes.recording, overdispersion_of(pose_chi2, use.sum(axis=1))
+            ),
         )
 
     def _own_of_recordings(self, place: Place, std: _Float) -> tuple[dict[str, tuple[float, float]], ...]:
@@ -603,7 +606,7 @@ class RecordingFit:
         return after
 
     def _sensor_fields(
-        self, zone: _Float, noise: _Noise, systematic: _Float, recording: RecordingSizes
+        self, zone: _Float, noise: _Noise, systematic: _Float, recording: RecordingSizes, overdispersion: float
     ) -> dict[str, object]:
         """Return zone offsets, noise law, systematic errors and what recordings differ by as fields of the sensor."""
         fields: dict[str, object] = {}
@@ -623,8 +626,24 @@ class RecordingFit:
                 "systematic_bearing_deg": math.degrees(bearing),
                 "systematic_height_m": height,
                 "systematic_time_s": time,
+                "overdispersion": overdispersion,
             }
         return {name: rounded(value) for name, value in fields.items()}
+
+
+def overdispersion_of(chi2: _Float, pixels: NDArray[np.int64]) -> float:
+    """Return by what share χ² of frames, (K,), scatters more about its mean than that of so many normal residuals.
+
+    0 where that may be chance: of K frames the variance of χ² is known to a share of √(2 / K).
+    """
+    fewest = 8  # pixels of a frame whose χ² tells anything
+    told = pixels >= fewest
+    if not told.any():
+        return 0.0
+    n = pixels[told]
+    share = chi2[told].sum() / n.sum()
+    excess = float((n * (chi2[told] / n / share - 1) ** 2).mean()) / 2 - 1
+    return excess if excess > 2 * math.sqrt(2 / len(n)) else 0.0
 
 
 def _spread(residual: _Float) -> float:

@@ -33,6 +33,7 @@ _COMMON = {
     **dict.fromkeys(("systematic_distance_m", "systematic_delta_deg", "systematic_bearing_deg"), _UNEXPLAINED),
     "systematic_height_m": _UNEXPLAINED,
     "systematic_time_s": "calibrated: jitter of the stamps",
+    "overdispersion": "calibrated: scatter of χ² of the frames",
 }
 """What stands behind the fields that no parameter of the mounting has."""
 

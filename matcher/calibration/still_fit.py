@@ -373,7 +373,7 @@ class StillFit:
     def p_value(self, place: Place, *, less: float = 0.0) -> float:
         """Return the chance of a χ² as large as that of a place less something."""
         cost, dof = np.array([max(place.cost - less, 0.0)]), np.array([self.dof(place)])
-        return float(p_values_of(cost, dof, self.evidence.scatter_freedom[:1])[0])
+        return float(p_values_of(cost, dof, self.evidence.noise_tails[:1])[0])
 
     def pose_std(self, place: Place) -> PoseStd:
         """Return the sizes of the poses' errors of the greatest restricted likelihood, linearised about a place."""

@@ -210,7 +210,7 @@ class LikelihoodMatcher:
         # what an answer leaves to unknown things costs the other view, too
         left = np.maximum(seen.returned.sum(axis=1) - dof - len(self._setup.free), 0)
         false_alarm = self._setup.rules.false_alarm
-        limit = largest_costs(false_alarm, dof, evidence.scatter_freedom[accepted]) + DISAGREEMENT * left
+        limit = largest_costs(false_alarm, dof, evidence.noise_tails[accepted]) + DISAGREEMENT * left
         found = search.of_frames(accepted).may_explain(seen.mirrored(self._bank.sensor.cols), limit)
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))

@@ -333,9 +333,9 @@ def _p_values(
     own = pixels.among(edges)
     cost = sums.cost + _further_cost(own) - DISAGREEMENT * own.unexplained.sum(axis=1)
     freedom = np.clip(_residuals(problem, own) - fitted, 0, dof)
-    nu = problem.evidence.scatter_freedom[problem.frame]
-    at_edges, inside = p_values_of(cost, freedom, nu), p_values_of(tested - cost, dof - freedom, nu)
-    whole = p_values_of(tested, dof, nu)
+    tails = problem.evidence.noise_tails[problem.frame]
+    at_edges, inside = p_values_of(cost, freedom, tails), p_values_of(tested - cost, dof - freedom, tails)
+    whole = p_values_of(tested, dof, tails)
     apart = (freedom >= 1) & (dof - freedom >= 1)
     return np.where(apart, worse_of_two(at_edges, inside), whole)
 

@@ -18,7 +18,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.chi_squared import scatter_freedom
+from phasemark.matcher.chi_squared import noise_tails
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, one_frame_limit_m
@@ -47,8 +47,8 @@ class Evidence:
         The same frames as the coarse search sees them. What one frame cannot measure to 0.1 rad is no return there,
         whether or not the camera dropped it. Those pixels keep their `weight`: where a model is bright enough, a fit
         compares them.
-    scatter_freedom : (n,) float64
-        ν of frames whose noise was estimated from ν + 1 exposures; infinite elsewhere.
+    noise_tails : (n, 2) float64
+        What widens the law of χ²; see :func:`~phasemark.matcher.chi_squared.noise_tails`.
     on : {"ranges", "phasors"}
     sensor : Sensor
     tilt_rad : (n, 2) float64
@@ -59,7 +59,7 @@ class Evidence:
     weight: NDArray[np.float64]
     one_frame_std_m: NDArray[np.float64]
     seen: Observation
-    scatter_freedom: NDArray[np.float64]
+    noise_tails: NDArray[np.float64]
     on: ResidualKind
     sensor: Sensor
     tilt_rad: NDArray[np.float64]
@@ -82,9 +82,9 @@ class Evidence:
         strong = measured & ~(one_frame_m2 > one_frame_limit_m(sensor) ** 2)
         seen = Observation(whole.range_m, whole.weight, strong, whole.not_returned | (measured & ~strong))
         turn = np.asarray(np.where(measured, np.exp(1j * seen.range_m / sensor.metres_per_radian), 0.0), np.complex128)
-        nu, tilt_rad = scatter_freedom(frames), frames.tilts_rad
+        tails, tilt_rad = noise_tails(frames), frames.tilts_rad
         if on == "ranges":
-            return cls(turn, whole.weight, one_frame_std_m, seen, nu, on, sensor, tilt_rad)
+            return cls(turn, whole.weight, one_frame_std_m, seen, tails, on, sensor, tilt_rad)
         if frames.amplitude_e is None or frames.intensity_e is None:
             raise UsageError('on="phasors" needs frames with amplitude and intensity: match on="ranges"')
         shape = seen.range_m.shape
@@ -93,12 +93,12 @@ class Evidence:
         intensity = np.where(measured, frames.intensity_e.reshape(shape), 0.0)
         variance = np.maximum(phase_image_variance(intensity, sensor), 1.0) / (2 * unit**2)
         weight = np.where(measured, n_effective / variance, 0.0)
-        return cls(turn * amplitude, weight, one_frame_std_m, seen, nu, on, sensor, tilt_rad)
+        return cls(turn * amplitude, weight, one_frame_std_m, seen, tails, on, sensor, tilt_rad)
 
     def __getitem__(self, index: NDArray[np.integer] | slice) -> Evidence:
         return Evidence(
             self.value[index], self.weight[index], self.one_frame_std_m[index], self.seen[index],
-            self.scatter_freedom[index], self.on, self.sensor, self.tilt_rad[index],
+            self.noise_tails[index], self.on, self.sensor, self.tilt_rad[index],
         )  # fmt: skip
 
     def with_further_noise(self, std_m: float) -> Evidence:

@@ -69,10 +69,10 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
         Cost of a scene without a landmark.
     """
     setup = scene.setup
-    which, nu = _worth_a_search(setup, evidence, bare), evidence.scatter_freedom
+    which, tails = _worth_a_search(setup, evidence, bare), evidence.noise_tails
     # 1, 2  bound the cost in every cell of the bank, and start in those that may hold an explanation
     cost_of = costs_on_scout(scene, evidence, which)
-    limit, search = _limit(setup, seen[which], nu[which]), scene.search.of_frames(which)
+    limit, search = _limit(setup, seen[which], tails[which]), scene.search.of_frames(which)
     if setup.reports_one_surface:  # where most zones see other things, no view explains a frame
         limit = np.full(len(which), np.inf)
     starts = search.starts(seen[which], limit, cost_of)
@@ -105,8 +105,8 @@ def _with_rivals(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits
         if not best.size:
             return fits
         which = fits.frame[best]
-        limit, most = _limit(setup, seen[which], evidence.scatter_freedom[which]), _most(setup, evidence[which])
-        closed_limit = _limit(setup, evidence.seen[which], evidence.scatter_freedom[which])
+        limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), _most(setup, evidence[which])
+        closed_limit = _limit(setup, evidence.seen[which], evidence.noise_tails[which])
         if setup.huber is None:
             most = np.minimum(most, fits.cost[best] + setup.rules.rival_cost)
         if evidence.on == "ranges" and setup.huber is None:
@@ -157,15 +157,15 @@ def _in_parts(starts: Starts, n: int) -> Iterator[NDArray[np.int64]]:
         yield np.flatnonzero((part == number) & (count > 0))
 
 
-def _limit(setup: Setup, seen: Observation, nu: NDArray[np.float64]) -> NDArray[np.float64]:
+def _limit(setup: Setup, seen: Observation, tails: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the bound up to which a cell may hold an explanation: a rival of the worst fit that is accepted."""
-    return largest_costs(setup.rules.false_alarm, seen.returned.sum(axis=1), nu) + setup.rules.rival_cost
+    return largest_costs(setup.rules.false_alarm, seen.returned.sum(axis=1), tails) + setup.rules.rival_cost
 
 
 def _most(setup: Setup, evidence: Evidence) -> NDArray[np.float64]:
     """Return the cost up to which a view explains a frame."""
     residuals = evidence.per_pixel * np.count_nonzero(evidence.weight, axis=1)
-    return largest_costs(setup.rules.false_alarm, residuals, evidence.scatter_freedom) + setup.rules.rival_cost
+    return largest_costs(setup.rules.false_alarm, residuals, evidence.noise_tails) + setup.rules.rival_cost
 
 
 def are_doubtful(setup: Setup, fits: Fits, n: int, p: float | None = None) -> NDArray[np.bool_]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
-from phasemark.matcher.chi_squared import p_values_of, scatter_freedom
+from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, phases_wrap
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match, Reason
@@ -97,7 +97,7 @@ class NearestMatcher:
         none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
         chi2, dof = self._goodness(pose_seen, class_seen, found)
-        p_value = p_values_of(chi2, dof, scatter_freedom(frames))
+        p_value = p_values_of(chi2, dof, noise_tails(frames))
         good = enough & (p_value >= self._false_alarm)
         ambiguous = self._is_ambiguous(frames, pose_seen, class_seen, found, good, chi2)
         nothing = Match(
@@ -168,7 +168,7 @@ class NearestMatcher:
             others.i[:, c], others.j[:, c], others.cost[:, c] = i[k, m], j[k, m], cost[k, m]
             theirs, dof = self._goodness(pose_seen[frame], None if class_seen is None else class_seen[frame], others)
             as_good = theirs < chi2[frame] + DISAGREEMENT
-            as_good |= p_values_of(theirs, dof, scatter_freedom(frames[frame])) >= self._false_alarm
+            as_good |= p_values_of(theirs, dof, noise_tails(frames[frame])) >= self._false_alarm
             ambiguous[frame[as_good]] = True
         return ambiguous
 

@@ -161,6 +161,9 @@ class Sensor(SensorQuantities):
     systematic_time_s : float
         Standard deviation of the jitter of the stamps, seconds. While the camera moves, a stamp that is off by that
         much moves the pose by that time's motion.
+    overdispersion : float
+        By how much χ² of single frames scatters more than noise of the law alone makes it: the variance of χ² with ν
+        degrees of freedom is 2 ν (1 + overdispersion).
     recording_range_m, recording_pitch_deg, recording_roll_deg, recording_bearing_deg : float
         Standard deviation by which range offset, tilt and bearing of another recording differ from those of this file:
         what putting the camera on again, temperature and the reference of the poses change.

@@ -147,6 +147,7 @@ class SensorFields(FieldTable):
     systematic_bearing_deg: _NonNegative = 0.0
     systematic_height_m: _NonNegative = 0.0
     systematic_time_s: _NonNegative = 0.0
+    overdispersion: _NonNegative = 0.0
     recording_range_m: _NonNegative = 0.0
     recording_pitch_deg: _NonNegative = 0.0
     recording_roll_deg: _NonNegative = 0.0
