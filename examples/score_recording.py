@@ -15,13 +15,16 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-THICKNESS_M, FACING_DEG, GROSS_M, GROSS_DEG = 0.01, 45.0, 0.03, 6.0
-CONFIDENCE, INSIDE_95 = 0.95, 5.991
+from phasemark import UsageError
+from phasemark.matcher.accuracy.pose_score import PoseScore
+
+THICKNESS_M, FACING_DEG, GROSS = 0.01, 45.0, (30.0, 6.0)
 Floats = NDArray[np.float64]
 
 
@@ -37,8 +40,29 @@ def numbers(table: dict[str, list[str]], name: str) -> Floats:
     return np.array([float(cell or "nan") for cell in table[name]])
 
 
-def errors(estimates: dict[str, list[str]], poses: dict[str, list[str]]) -> tuple[Floats, Floats, Floats]:
-    """Return errors in distance from the panel's front (m) and heading (°), (n, 2), covariances, and true headings."""
+@dataclass(frozen=True)
+class Compared:
+    """Estimates of a recording beside motion capture, a line each frame: millimetres and degrees."""
+
+    error: Floats
+    covariance: Floats
+    accepted: NDArray[np.bool_]
+    faces: NDArray[np.bool_]
+    true_mm: Floats
+
+    @property
+    def score(self) -> PoseScore:
+        """The score of the frames that face the panel."""
+        return PoseScore.of(self.error, self.covariance, self.accepted, self.faces, GROSS)
+
+    def answered(self, most_mm: float) -> tuple[int, int]:
+        """Return how many frames that face the panel from nearer than that are answered, and how many there are."""
+        near = self.faces & (np.abs(self.true_mm) <= most_mm)
+        return int((near & self.accepted).sum()), int(near.sum())
+
+
+def compared(estimates: dict[str, list[str]], poses: dict[str, list[str]]) -> Compared:
+    """Compare distances from the panel's front and headings with those of motion capture."""
     time, t_ms = numbers(estimates, "pose_time_s"), numbers(poses, "t_ms")
     stamps, first = np.unique(t_ms / 1e3, return_index=True)
     x = np.interp(time, stamps, -numbers(poses, "x_m")[first], left=np.nan, right=np.nan)
@@ -47,51 +71,38 @@ def errors(estimates: dict[str, list[str]], poses: dict[str, list[str]]) -> tupl
     delta = (delta + 90) % 180 - 90  # the panel looks the same every 180°
     slope = -distance * np.sin(np.radians(delta)) * np.radians(1)
     jacobian = np.stack([np.cos(np.radians(delta)), slope, 0 * delta, 1 + 0 * delta], axis=1).reshape(-1, 2, 2)
+    jacobian[:, 0] *= 1e3
     std = np.stack([numbers(estimates, f"{name}_std_{unit}") for name, unit in (("distance", "m"), ("delta", "deg"))])
     covariance = np.einsum("in,jn->nij", std, std)
     covariance[:, [0, 1], [1, 0]] *= numbers(estimates, "corr_distance_delta")[:, None]
-    error = np.stack([distance * np.cos(np.radians(delta)) - THICKNESS_M / 2 - x, delta - heading], axis=1)
+    error = np.stack([1e3 * (distance * np.cos(np.radians(delta)) - THICKNESS_M / 2 - x), delta - heading], axis=1)
     error[:, 1] = (error[:, 1] + 180) % 360 - 180
-    return error, jacobian @ covariance @ jacobian.transpose(0, 2, 1), (heading + 180) % 360 - 180
+    heading = (heading + 180) % 360 - 180
+    return Compared(
+        error=error,
+        covariance=jacobian @ covariance @ jacobian.transpose(0, 2, 1),
+        accepted=np.array([cell == "true" for cell in estimates["accepted"]]),
+        faces=np.isfinite(x) & (np.abs(heading) < FACING_DEG),
+        true_mm=1e3 * x,
+    )
 
 
-def longest_run(good: NDArray[np.bool_]) -> int:
-    """Return the length of the longest run of True."""
-    ends = np.flatnonzero(~np.concatenate([[False], good, [False]]))
-    return int(np.diff(ends).max()) - 1
-
-
-def report(estimates: dict[str, list[str]], poses: dict[str, list[str]]) -> str:
-    """Say how estimates agree with the poses."""
-    error, covariance, heading = errors(estimates, poses)
-    known = np.isfinite(error).all(axis=1)
-    accepted = np.array([cell == "true" for cell in estimates["accepted"]])
-    truth = np.isfinite(heading) & (np.abs(heading) < FACING_DEG)
-    used = accepted & truth & known
-    gross = accepted & known & ((np.abs(error) > [GROSS_M, GROSS_DEG]).any(axis=1))
-    n = int((accepted & known).sum())
-    if not used.any():
-        return "no accepted frame faces the panel and has a truth to compare with"
-    bias = np.median(error[used], axis=0)
-    mad = np.median(np.abs(error[used] - bias), axis=0)
-    rms = np.sqrt(((error[used] - bias) ** 2).mean(axis=0))
-    std = np.median(np.sqrt(np.einsum("nii->ni", covariance[used])), axis=0)
-    squared = np.einsum("ni,nij,nj->n", error[used], np.linalg.inv(covariance[used]), error[used])
-    run = longest_run(~gross[accepted & known])
-    lines = [
-        f"answered: {used.sum()} of {truth.sum()} frames that face the panel ({100 * used.sum() / truth.sum():.0f} %)",
+def report(score: PoseScore) -> str:
+    """Describe how estimates agree with the poses."""
+    return "\n".join([
+        f"answered: {score.answered} of {score.expected} frames that face the panel"
+        f" ({100 * score.answered / score.expected:.0f} %)",
         *(
-            f"{name}: bias {scale * bias[k]:.2f}, MAD {scale * mad[k]:.2f}, r.m.s. about the bias"
-            f" {scale * rms[k]:.2f}, median standard deviation {scale * std[k]:.2f}"
-            for k, (name, scale) in enumerate((("distance (mm)", 1e3), ("heading (°)", 1.0)))
+            f"{name}: bias {score.bias[k]:.2f}, MAD {score.mad[k]:.2f}, r.m.s. about the bias {score.rms[k]:.2f},"
+            f" median standard deviation {score.std[k]:.2f}"
+            for k, name in enumerate(("distance (mm)", "heading (°)"))
         ),
-        f"truth inside the 95 % ellipse: {100 * (squared < INSIDE_95).mean():.0f} %",
-        f"accepted beyond 30 mm or 6°: {gross.sum()} of {n}"
-        + (f", so at most {300 / n:.2g} % at 95 %" if not gross.any() else ""),
-        f"longest run without one: {run}, which shows a reliability of {100 * (1 - CONFIDENCE) ** (1 / run):.1f} % with"
-        f" a confidence of {100 * CONFIDENCE:.0f} %",
-    ]
-    return "\n".join(lines)
+        f"truth inside the 95 % ellipse: {100 * score.inside.value:.0f} %",
+        f"accepted beyond 30 mm or 6°: {score.gross} of {score.accepted}, so at most"
+        f" {100 * score.gross_at_most:.2g} % at 95 %",
+        f"longest run without one: {score.run}, which shows a reliability of {100 * score.reliability:.1f} % with a"
+        " confidence of 95 %",
+    ])  # fmt: skip
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -101,10 +112,12 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("poses", type=Path, help="poses of motion capture")
     arguments = parser.parse_args(argv)
     try:
-        print(report(columns(arguments.estimates), columns(arguments.poses)))
+        print(report(compared(columns(arguments.estimates), columns(arguments.poses)).score))
     except KeyError as error:
         print(f"error: no column {error} in {arguments.estimates} or {arguments.poses}", file=sys.stderr)
         return 3
+    except UsageError as error:
+        print(error)
     except (ValueError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 3

@@ -9,14 +9,17 @@ import os
 import runpy
 import subprocess
 import sys
+from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from scipy import stats
 
 from phasemark.cli import main
+from phasemark.matcher.accuracy.pose_score import PoseScore
 
 pytestmark = pytest.mark.docs
 
@@ -284,6 +287,125 @@ def test_tables_without_a_column_are_refused_by_its_name(tmp_path):
     code, _, err = run("score_recording", tmp_path / "bare.csv", tmp_path / "bare.csv")
     assert (code, err.count("\n")) == (3, 1)
     assert "no column 'pose_time_s'" in err
+
+
+class Tables(HTMLParser):
+    """The rows of cells of a page, and what it would load."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.rows, self.loaded, self.inside = [], [], False
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.inside = tag in ("td", "th")
+        self.loaded += [value for name, value in attrs if name == "src" and not value.startswith("data:")]
+        if tag == "tr":
+            self.rows.append([])
+        elif self.inside:
+            self.rows[-1].append("")
+
+    def handle_endtag(self, tag):
+        self.inside &= tag not in ("td", "th")
+
+    def handle_data(self, data):
+        if self.inside:
+            self.rows[-1][-1] += data
+
+
+def finite(value):
+    """Return whether all numbers of plain data are there and finite."""
+    if isinstance(value, (dict, list)):
+        return all(map(finite, value.values() if isinstance(value, dict) else value))
+    return isinstance(value, str) or (value is not None and np.isfinite(value))
+
+
+def test_the_accuracy_of_recordings_becomes_a_page_beside_its_bars(tmp_path, monkeypatch):
+    """A second recording is matched with the calibration of the first and its own delay; histograms are not fitted."""
+    for name, seed, own in (("panel", 1, (-0.08, -9e-3, 1.6)), ("other", 2, (0.05, -6e-3, 2.2))):
+        given = dict(zip(("delay_s", "offset_m", "bearing_deg"), own, strict=True))
+        write_recording(tmp_path / f"{name}.csv", np.random.default_rng([5, seed]), n=60, floor=False, **given)
+
+    def locate(arguments):
+        folder = Path(arguments[arguments.index("--out") + 1])
+        folder.mkdir(parents=True)
+        row = {
+            "median_mm": 1.0,
+            "p90_mm": 2.0,
+            "median_deg": 1.0,
+            "p90_deg": 2.0,
+            "predicted_mm": 1.2,
+            "inside_95": 0.9,
+        }
+        tables = {"block": [{"poses": k, **row} for k in (1, 4, 8, 16)]}
+        (folder / "direct_sensor.json").write_text(json.dumps({"poses": tables}))
+
+    monkeypatch.syspath_prepend(EXAMPLE.parent)
+    monkeypatch.setattr(importlib.import_module("direct_sensor"), "main", locate)
+    (tmp_path / "ladder.npz").touch()
+    grid = ("--distance", "0.53:0.75:0.01", "--delta=-32:32:1")
+    recordings = (tmp_path / "panel.csv", tmp_path / "other.csv")
+    code, out, err = run(
+        "real_accuracy", "--panel", *recordings, "--tmf8820", tmp_path, *grid, "--out", tmp_path / "out"
+    )
+    assert (code, err) == (0, "")
+    text = (tmp_path / "out" / "accuracy.html").read_text(encoding="utf-8")
+    page = Tables(text)
+    assert page.loaded == []
+    numbers = json.loads((tmp_path / "out" / "accuracy.json").read_text(encoding="utf-8"))
+    assert finite(numbers)
+    halves, whole, other = numbers["panel"].values()
+    assert [one["expected"] for one in (whole, other)] == pytest.approx([60, 60], abs=3)  # ends have no truth
+    for one, delay_ms in ((halves, -80), (whole, -80), (other, 50)):
+        assert abs(one["delay_ms"][0] - delay_ms) < 4 * one["delay_ms"][1] < 60
+        assert one["gross"] == 0
+        assert one["reliability"] == pytest.approx(0.05 ** (1 / one["run"]))
+        assert one["inside"]["low"] < one["inside"]["value"] <= one["inside"]["high"]
+    assert whole["std"] < halves["std"]  # lists: without what recordings differ by
+    with (tmp_path / "out" / "accuracy.csv").open(newline="", encoding="utf-8") as file:
+        bars = list(csv.DictReader(file))
+    assert len(bars) == len(numbers["bars"]) == 3 * 7 + 3 + 2
+    held = {(bar["recording"], bar["quantity"]): bar["held"] for bar in bars}
+    assert held["block", "16 poses: median error of the position"] == "true"
+    assert held["block", "16 poses: median error of the rotation"] == "false"
+    cells = {(row[0], row[1]): row[-1] for row in page.rows if len(row) == 5}
+    assert all(cells[key] == ("held" if value == "true" else "NOT held") for key, value in held.items())
+    for line in out.splitlines()[2:9]:  # the printed table is that of the page
+        assert [cell.strip() for cell in line.strip("|").split("|")] in page.rows
+    assert (tmp_path / "out" / "errors.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_recordings_that_are_none_have_no_accuracy_and_leave_one_line(tmp_path):
+    (tmp_path / "bare.csv").write_text("t_ms,mm_0\n1,2\n")
+    for given, part in (
+        (("--panel", tmp_path / "bare.csv"), "no column 'panel_x_m'"),
+        (("--panel", tmp_path / "none.csv"), "none.csv: no such file"),
+        (("--tmf8820", tmp_path), "ladder.npz: no such file"),
+    ):
+        code, out, err = run("real_accuracy", *given, "--out", tmp_path / "out")
+        assert (code, out, err.count("\n")) == (3, "", 1)
+        assert err.startswith("error: ")
+        assert part in err
+    with pytest.raises(SystemExit, match="2"):
+        run("real_accuracy")
+
+
+def test_a_score_counts_runs_false_answers_and_truths_inside():
+    """Of 100 answers the 61st is false; errors of one standard deviation lie inside the 95 % ellipse, of 3 do not."""
+    error = np.tile([[1.0, 0.5]], (100, 1)) * np.where(np.arange(100) % 10 == 0, 3.0, 1.0)[:, None]
+    error[60] = [31.0, 0.0]
+    error[99] = np.nan  # without a truth
+    accepted = np.arange(100) != 5
+    covariance = np.tile(np.diag([1.0, 0.25]), (100, 1, 1))
+    score = PoseScore.of(error, covariance, accepted, np.arange(100) < 50, (30.0, 6.0))
+    assert (score.expected, score.answered, score.accepted, score.gross, score.run) == (50, 49, 98, 1, 59)
+    assert score.reliability == pytest.approx(0.95, abs=1e-3)  # 59 in a row: the classical table of ln(0.05)/ln(0.95)
+    assert score.bias == (1.0, 0.5)
+    assert score.rms[0] == pytest.approx(np.sqrt(5 * 2.0**2 / 49))
+    assert score.inside.value == pytest.approx(44 / 49)
+    assert score.gross_at_most == pytest.approx(stats.beta.ppf(0.95, 2, 97))  # one-sided, exact
+    none = PoseScore.of(error[:50], covariance[:50], accepted[:50], accepted[:50], (30.0, 6.0))
+    assert none.gross_at_most == pytest.approx(3 / 49, rel=0.05)
 
 
 @pytest.mark.skipif("PHASEMARK_RECORDING" not in os.environ, reason="PHASEMARK_RECORDING names no recording")
