@@ -17,6 +17,7 @@ import contextlib
 import io
 import json
 import math
+import shlex
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -311,7 +312,7 @@ def main(argv: list[str] | None = None) -> int:
     options = parser.parse_args(argv)
     if not options.panel and options.tmf8820 is None:
         parser.error("nothing to measure: give --panel CSV, --tmf8820 FOLDER or both")
-    command = " ".join(["python examples/real_accuracy.py", *(argv if argv is not None else sys.argv[1:])])
+    command = shlex.join(["python", "examples/real_accuracy.py", *(sys.argv[1:] if argv is None else argv)])
     objects: dict[str, list[dict[str, float]]] = {}
     try:
         for path in (*options.panel, *([] if options.tmf8820 is None else [options.tmf8820 / "ladder.npz"])):

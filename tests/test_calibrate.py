@@ -943,17 +943,16 @@ def delay_of_another(seed, found, truth, zone, n=20):
     z_m = frames.range_m * TOF.axis_cosine()
     again = Frames((z_m / found.sensor.axis_cosine())[:, None], sensor=found.sensor, time_s=frames.time_s[:, None])
     delay = calibrate(BOARD, kalman_filter(again), poses, free=["delay"], moving=True)
-    assert not delay.doubts
     return (delay.value("delay") - other[-1]) / delay.std("delay"), delay
 
 
 def test_the_delay_of_another_recording_is_found_alone_and_the_calibration_kept(rides):
-    """The sum of 6 squares of errors over σ is χ²(6); the recording differs in what the sensor states of recordings."""
+    """The sum of 4 squares of errors over σ is χ²(4); the recording differs in what the sensor states of recordings."""
     _, found, truth, zone = rides[0]
-    errors, delays = zip(*(delay_of_another(seed, found, truth, zone) for seed in range(6)), strict=True)
-    assert stats.chi2.ppf(5e-4, 6) < np.square(errors).sum() < stats.chi2.ppf(1 - 5e-4, 6)
+    errors, delays = zip(*(delay_of_another(seed, found, truth, zone) for seed in range(4)), strict=True)
+    assert stats.chi2.ppf(5e-4, 4) < np.square(errors).sum() < stats.chi2.ppf(1 - 5e-4, 4)
     for one in delays:
-        assert one.free == ("delay",)
+        assert (one.free, one.doubts) == (("delay",), ())
         assert 1e-4 < one.std("delay") < 0.01  # of 1.3 s
         assert {"range_offset", "pitch", "roll", "bearing", "turn"} == set(one.own[0])
         kept, before = one.sensor.model_dump(), found.sensor.model_dump()
@@ -983,8 +982,8 @@ def test_a_delay_alone_takes_one_recording_that_moves_and_is_not_too_short(rides
 
 @pytest.mark.soak
 def test_delays_of_other_recordings_are_within_two_sigma_in_90_to_99_percent_of_200():
+    cameras = [moved(seed)[1:] for seed in range(10)]
     for n in (12, 40):
-        cameras = [moved(seed)[1:] for seed in range(10)]
         inside = sum(abs(delay_of_another(seed, *cameras[seed % 10], n)[0]) < 2 for seed in range(200))
         print(f"delay of another recording of {n} frames: {inside} of 200 within 2 standard deviations")
         assert 180 <= inside <= 198
