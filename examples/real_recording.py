@@ -88,6 +88,7 @@ def read_recording(path: Path, sensor: Sensor, needed: tuple[str, ...], half: st
     with warnings.catch_warnings(record=True) as notes:
         warnings.simplefilter("always")
         frames = read_frames(path, sensor=sensor, unit="mm", quantity="z", valid_status=[5]).each_a_position()
+    frames.tilt_rad = None  # of the drone, a nose up being positive, and noisier than what the panel shows of it
     for note in notes:
         print(f"note: {note.message}", file=sys.stderr)
     with path.open(newline="", encoding="utf-8") as file:

@@ -36,7 +36,7 @@ from phasemark.render.rigid import product
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.threads import mapped
-from phasemark.render.view import VIEW_FIELDS, Views
+from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -645,14 +645,16 @@ class Renderer:
         low, high = self.topology.low, self.topology.high
         lens = views.lens_in_landmark()
         inside = ((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1)
-        if inside.any():
-            radius = float(np.hypot(*self.topology.vertices[:, :2].T).max())
-            inside &= np.hypot(lens[:, 0], lens[:, 1]) < radius + 1e-3
+        if not inside.any():
+            return
+        footprint = Footprint.of_vertices(self.topology.vertices)
+        inside &= np.hypot(lens[:, 0], lens[:, 1]) < footprint.radius_m + 1e-3
         near = np.flatnonzero(inside)
         if near.size:
+            least_m = float(footprint.nearest_m(views.delta_rad[near[:1]], 1e-3)[0])
             raise UsageError(
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
-                f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {radius:.3g}"
+                f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {least_m:.3g} at this 'delta_rad'"
             )
 
 

@@ -292,3 +292,53 @@ class Views:
             ],
             axis=-1,
         )
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """Box and circle around landmarks, seen from above.
+
+    Parameters
+    ----------
+    low_m, high_m : (2,) float64
+        Corners of the box, x' and y'.
+    radius_m : float
+        Largest distance of a point from the axis.
+    """
+
+    low_m: NDArray[np.float64]
+    high_m: NDArray[np.float64]
+    radius_m: float
+
+    @classmethod
+    def of_vertices(cls, vertices: NDArray[np.float64]) -> Footprint:
+        """Take the points of landmarks, (n, 3), landmark frame."""
+        across = np.asarray(vertices[:, :2], np.float64)
+        return cls(across.min(axis=0), across.max(axis=0), float(np.hypot(*across.T).max()))
+
+    def nearest_m(self, delta_rad: NDArray[np.float64], gap_m: float) -> NDArray[np.float64]:
+        """Return from which D on the lens is outside of the box or of the circle, with a gap.
+
+        Parameters
+        ----------
+        delta_rad : (n,) float64
+        gap_m : float
+            Between the lens and the nearest side.
+
+        Returns
+        -------
+        (n,) float64
+            A flat landmark may be seen from within its circle, where its front is before the lens.
+        """
+        towards = -np.stack([np.cos(delta_rad), np.sin(delta_rad)], axis=-1)
+        towards = np.where(towards == 0, 1e-300, towards)
+        ends = np.stack([(self.low_m - gap_m) / towards, (self.high_m + gap_m) / towards])
+        enters, leaves = ends.min(axis=0).max(axis=-1), ends.max(axis=0).min(axis=-1)
+        leaves = np.where((enters < leaves) & (leaves > gap_m), leaves, gap_m)
+        return np.asarray(np.minimum(leaves, self.radius_m + gap_m))
+
+    def reach_m(self, delta_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how far behind their axis landmarks reach at most, (n,)."""
+        away = np.stack([np.cos(delta_rad), np.sin(delta_rad)], axis=-1)
+        farthest = np.maximum(away * self.low_m, away * self.high_m).sum(axis=-1)
+        return np.asarray(np.minimum(farthest, self.radius_m))

@@ -184,12 +184,15 @@ def test_trials_of_a_matcher_that_estimates_something_else_are_refused(matcher_o
 
 @pytest.mark.parametrize("background", [None, Background(wall_m=2.5), Background(floor_m=0.3)])
 def test_a_model_given_a_background_has_the_limits_of_one_built_with_it(bank, background):
-    built = RenderedModel(bank, background).limits()
+    delta = np.radians([0.0, 30.0, 90.0, 200.0])
+    built = RenderedModel(bank, background).limits(delta)
     for before in (None, Background(wall_m=3.0)):
-        assert RenderedModel(bank, before).with_background(background).limits() == built
+        np.testing.assert_array_equal(RenderedModel(bank, before).with_background(background).limits(delta), built)
     if background is not None and background.wall_m is not None:
-        radius = max(np.hypot(*bank.mesh(name).vertices[:, :2].T).max() for name in bank.classes)
-        assert built[1] + radius < background.wall_m  # the landmark stands before the wall, whichever side it shows
+        for name in bank.classes:  # the landmark stands before the wall, whichever side it shows
+            x, y = bank.mesh(name).vertices[:, :2].T
+            reach = np.cos(delta)[:, None] * x + np.sin(delta)[:, None] * y
+            assert (built[1] + reach.max(axis=1) < background.wall_m).all()
 
 
 @pytest.mark.parametrize("huber", [None, 2.0])
@@ -331,7 +334,7 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
     model = RenderedModel(bank).with_background(*walls)
     problem = Problem(model, evidence, frame, class_index, settings, np.full(3, np.inf))
     np.testing.assert_array_equal(problem.for_candidates(behind), behind[frame])
-    farthest = np.array([RenderedModel(bank, wall).limits()[1] for wall in walls])
+    farthest = np.array([RenderedModel(bank, wall).limits(np.zeros(1))[1][0] for wall in walls])
     far = np.array([[5.0, 0, 0, 0, 0, 0]])
     np.testing.assert_array_equal(problem.clipped(np.repeat(far, 3, axis=0), np.arange(3))[:, 0], farthest[frame])
     assert problem.some(np.array([1])).clipped(far.copy(), np.arange(1))[0, 0] == farthest[0]

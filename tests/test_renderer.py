@@ -295,7 +295,7 @@ def test_a_background_needs_sound_distances(value):
 
 @pytest.mark.parametrize("distance_m", [0.01, 0.1, 0.12])
 def test_a_lens_inside_the_landmark_is_refused(distance_m):
-    with pytest.raises(UsageError, match=r"in view 0 the lens is inside .*'distance_m' must be above 0\.144"):
+    with pytest.raises(UsageError, match=r"in view 0 the lens is inside .*'distance_m' must be above 0\.121"):
         Renderer(CYLINDER, PMD).render(distance_m)
 
 

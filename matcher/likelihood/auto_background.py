@@ -144,8 +144,8 @@ class AutoBackground:
 
     def _leaves_room(self, background: Background) -> bool:
         """Return True if a landmark has a place between the lens and a wall."""
-        nearest, farthest = self._rendered.with_background(background).limits()
-        return bool(nearest < farthest)
+        nearest, farthest = self._rendered.with_background(background).limits(self._setup.bank.delta_rad)
+        return bool((nearest < farthest).all())
 
     def _searched_together(self, which: NDArray[np.int64], backgrounds: list[Background | None]) -> Fits:
         """Search frames with their backgrounds in the images of the bank."""

@@ -241,7 +241,7 @@ def fit_background(
             break
         there = at.copy()
         there[columns] += (step * scale)[: len(columns)]
-        there[0] = np.clip(there[0], *model.limits())
+        there[0] = np.clip(there[:1], *model.limits(there[1:2]))[0]
         placed = place + (step * scale)[len(columns) :]
         tried = sums_at(there, placed) if (placed > 0).all() else None
         if tried is not None and tried.cost[0] < sums.cost[0]:
@@ -267,8 +267,8 @@ def _sums_before(
     Each background in `beside` has one of these moved by a small step.
     """
     before, which = model.with_background(background), np.array([class_index])
-    nearest, farthest = before.limits()
-    if not nearest <= view[0] <= farthest:
+    nearest, farthest = before.limits(view[1:2])
+    if not nearest[0] <= view[0] <= farthest[0]:
         return None
     try:
         image = before.images(which, view[None], free)

@@ -112,7 +112,7 @@ class BankModel(ImageModel):
         inside = (high < faint) | (low > 1 - faint) | ((low > faint) & (high < 1 - faint))
         return inside & (bend < _STRAIGHT)
 
-    def limits(self) -> tuple[float, float]:
+    def limits(self, delta_rad: NDArray[np.float64], which: NDArray[np.integer] | None = None) -> tuple[float, float]:
         """Return the bank's first and last distance."""
         return float(self._distance[0]), float(self._distance[-1])
 

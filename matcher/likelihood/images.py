@@ -122,9 +122,13 @@ class ImageModel(ABC):
 
     def clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
         """Move views, in place, to distances that the model can show; `which` of all they are."""
-        nearest, farthest = self.limits()
-        view[:, 0] = np.clip(view[:, 0], nearest, farthest[which] if isinstance(farthest, np.ndarray) else farthest)
+        view[:, 0] = np.clip(view[:, 0], *self.limits(view[:, 1], which))
 
     @abstractmethod
-    def limits(self) -> tuple[float, float | NDArray[np.float64]]:
-        """Return the nearest and the farthest distance it can show, the latter for all views or for each of m."""
+    def limits(
+        self, delta_rad: NDArray[np.float64], which: NDArray[np.integer] | None = None
+    ) -> tuple[float | NDArray[np.float64], float | NDArray[np.float64]]:
+        """Return the nearest and the farthest distance it can show from m angles, for all of them or for each.
+
+        `which` of all views they belong to; None: all of the model's.
+        """

@@ -286,11 +286,11 @@ class LikelihoodMatcher:
 
     def _check_distances(self) -> None:
         """Check that the bank has distances at which views are rendered."""
-        nearest, (step_m, step_rad) = self._rendered.limits()[0], _FINE_GRID
+        nearest, (step_m, step_rad) = self._rendered.limits(self._bank.delta_rad)[0].min(), _FINE_GRID
         if self._bank.distance_m[-1] < nearest:
             raise UsageError(
-                f"the bank ends at {self._bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, half the"
-                " landmark's width, are not rendered: build it in steps of at most"
+                f"the bank ends at {self._bank.distance_m[-1]:g} m, and views nearer than {nearest:.3g} m, where the"
+                " lens is in the landmark, are not rendered: build it in steps of at most"
                 f" {step_m:g} m and {math.degrees(step_rad):.2g}°, and free"
                 " distance_m and delta_rad alone without a background"
             )

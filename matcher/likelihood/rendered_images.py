@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, cast
@@ -18,11 +19,12 @@ from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.background import Backgrounds
 from phasemark.render.direct.chip_renderer import ChipRenderer
+from phasemark.render.view import Footprint
 
 STEP = 1e-5
 """Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
 _BEFORE_LENS_M, _BEFORE_WALL_M = 5e-3, 1e-3
-"""Smallest gaps between the circle around a landmark and the lens, and the wall."""
+"""Smallest gaps between a landmark and the lens, and the wall."""
 
 
 class RenderedModel(ImageModel):
@@ -58,13 +60,14 @@ class RenderedModel(ImageModel):
         self.cache = ViewCache(cache_bytes)
         self._renderers = []
         self._factored = bank.lower is not None
-        self._radius_m = 0.0
+        vertices = []
         for name in bank.classes:
             mesh = bank.mesh(name)
             albedo = float(mesh.metadata["albedo"])
             chip = ChipRenderer(mesh, bank.sensor, albedo=albedo) if reported else renderer_of(bank, mesh, albedo)
             self._renderers.append(chip)
-            self._radius_m = max(self._radius_m, float(np.hypot(mesh.vertices[:, 0], mesh.vertices[:, 1]).max()))
+            vertices.append(np.asarray(mesh.vertices, np.float64))
+        self._footprint = Footprint.of_vertices(np.concatenate(vertices))
         self._bank_end_m = float(bank.distance_m[-1])
         self._stand_before([background])
 
@@ -73,13 +76,8 @@ class RenderedModel(ImageModel):
         self._backgrounds = tuple(backgrounds)
         self._frame: NDArray[np.int64] | None = None
         self._floors = any(background is not None and background.floor_m is not None for background in backgrounds)
-        self._farthest_m = np.array([self._farthest_before(background) for background in backgrounds])
-
-    def _farthest_before(self, background: Background | None) -> float:
-        """Return how far a landmark may be: before the wall."""
-        wall = None if background is None else background.wall_m
-        beyond_bank = 1.25  # without a wall a view may be this many times as far as the bank's last distance
-        return beyond_bank * self._bank_end_m if wall is None else wall - self._radius_m - _BEFORE_WALL_M
+        wall_m = [None if background is None else background.wall_m for background in backgrounds]
+        self._wall_m = np.array([math.inf if wall is None else wall for wall in wall_m])
 
     def renderer(self, class_index: int) -> Renderer:
         """Return what renders one class of the bank."""
@@ -108,10 +106,17 @@ class RenderedModel(ImageModel):
         other._backgrounds, other._floors = (None,) * len(self._backgrounds), False
         return other
 
-    def limits(self) -> tuple[float, float | NDArray[np.float64]]:
-        """Return how near the lens may come, and how far the landmark may be, in all views or in each of them."""
-        nearest = self._radius_m + _BEFORE_LENS_M
-        return nearest, float(self._farthest_m[0]) if self._frame is None else self._farthest_m[self._frame]
+    def limits(
+        self, delta_rad: NDArray[np.float64], which: NDArray[np.integer] | None = None
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return from where on the lens is outside of the landmark, and up to where this is before the wall."""
+        wall_m = self._wall_m[:1]
+        if self._frame is not None:
+            wall_m = self._wall_m[self._frame if which is None else self._frame[which]]
+        beyond_bank = 1.25  # without a wall a view may be this many times as far as the bank's last distance
+        before_wall = wall_m - self._footprint.reach_m(delta_rad) - _BEFORE_WALL_M
+        farthest = np.where(np.isinf(wall_m), beyond_bank * self._bank_end_m, before_wall)
+        return self._footprint.nearest_m(delta_rad, _BEFORE_LENS_M), farthest
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Render the views, and with them how they change.

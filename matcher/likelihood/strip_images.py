@@ -82,7 +82,7 @@ class StripModel(ImageModel):
         pixels = sensor.rows * _strips_of_column(sensor) * (sensor.cols + 2 * _margin(widest_columns))
         return bool(16 * n_class * max(n_d, 2) * max(n_a, 2) * pixels <= _MOST_BYTES)
 
-    def limits(self) -> tuple[float, float]:
+    def limits(self, delta_rad: NDArray[np.float64], which: NDArray[np.integer] | None = None) -> tuple[float, float]:
         """Return the bank's first and last distance."""
         return float(self._distance[0]), float(self._distance[-1])
 
