@@ -13,7 +13,8 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans.bank_plan import MeshPlan
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.render import Frames, Renderer, Views, capture, preset
+from phasemark.matcher.likelihood.rendered_images import RenderedModel
+from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 from phasemark.render.view import Footprint
 
 TOF = preset("vl53l5cx-8x8")
@@ -96,6 +97,15 @@ def test_a_coarse_bank_of_a_calibrated_sensor_has_a_scout(tmp_path):
         match = Matcher(built, "refine", background="unknown").match(kalman_filter(shifted))[0]
     assert match.accepted
     assert abs(match.distance_m - 0.6) < 0.005
+
+
+def test_views_edge_on_leave_room_for_the_lens_and_move_a_wall_back(bank):
+    model = RenderedModel(bank, Background(wall_m=2.0))
+    view = np.array([[0.6, 0.3, 0, 0, 0, 0], [5.0, math.pi / 2, 0, 0, 0, 0]])
+    model.clip(view, np.arange(2))
+    np.testing.assert_allclose(view[:, 0], [0.6, WIDE_M / 2 + 5e-3])
+    images = model.images(np.zeros(2, np.int64), view, ())
+    assert np.isfinite(images.phasor).all()
 
 
 def test_tilts_before_a_wide_panel_are_known_or_free_with_a_coarse_bank(bank):

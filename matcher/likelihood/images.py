@@ -122,7 +122,8 @@ class ImageModel(ABC):
 
     def clip(self, view: NDArray[np.float64], which: NDArray[np.integer]) -> None:
         """Move views, in place, to distances that the model can show; `which` of all they are."""
-        view[:, 0] = np.clip(view[:, 0], *self.limits(view[:, 1], which))
+        nearest, farthest = self.limits(view[:, 1], which)  # edge on, a wide landmark may leave no room between them
+        view[:, 0] = np.maximum(np.minimum(view[:, 0], farthest), nearest)
 
     @abstractmethod
     def limits(

@@ -263,10 +263,19 @@ class RenderedModel(ImageModel):
     def _given_way(self, class_index: int, views: Views, which: NDArray[np.integer]) -> Backgrounds:
         """Return the backgrounds of some views, floors lowered to where the landmark ends.
 
-        Floors are estimated, and heights are tried.
+        Floors are estimated, and heights are tried. So are views edge on to a wide landmark that reaches a wall.
         """
         if not self._floors:
-            return self._backgrounds[0] if self._frame is None else self._behind(which)
+            given = self._backgrounds[0] if self._frame is None else self._behind(which)
+            nearest, farthest = self.limits(views.delta_rad, which)
+            cut = np.isfinite(self._wall_m).any() & (nearest > farthest)
+            if not cut.any():
+                return given
+            vertices, seen = self._renderers[class_index].topology.vertices, views.in_camera(self.sensor)
+            return [
+                behind.giving_way(vertices, seen[np.array([k])]) if behind is not None and cut[k] else behind
+                for k, behind in enumerate(self._behind(which))
+            ]
         lowest_m = float(self._renderers[class_index].topology.vertices[:, 2].min())
         least_m = -(lowest_m + views.in_camera(self.sensor).height_m)
         return [
