@@ -8,8 +8,9 @@ data sets LCSPCData and SPAD-ICCP-Summer-School have recordings of this kind. Wi
 
 The fit sees every second distance of the plane and a quarter of the poses of each object. On what it has not seen, the
 example prints how well ranges and centroids are predicted, draws predicted beside measured histograms, and locates each
-object from 1, 4, 8 and 16 poses drawn at random. What is common to all objects (the frame of the arm against that of
-the objects) is taken from the poses of the fit. ``--top NAME=M`` states by how much an object is higher than its mesh.
+object from 1, 4, 8 and 16 poses drawn at random: against where its own poses of the fit found it, and, as an object
+that did not calibrate would be, against the mean of all objects. ``--others FOLDER`` locates the objects in recordings
+of that folder instead, and the fit sees all poses of ``--data``.
 """
 
 from __future__ import annotations
@@ -24,8 +25,17 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from phasemark.data.measured.histogram_logs import read_histograms
-from phasemark.matcher.histograms import ModelError, ObjectScene, evidence_of, match_jointly, solve_jointly
-from phasemark.render import preset
+from phasemark.matcher.histograms import (
+    ModelError,
+    ObjectScene,
+    PoseCalibration,
+    calibrate_poses,
+    evidence_of,
+    match_jointly,
+    pose_covariance,
+    solve_jointly,
+)
+from phasemark.render import Sensor, preset
 from phasemark.render.direct import (
     DirectFit,
     HistogramFrames,
@@ -49,13 +59,10 @@ NEAREST_M = 0.06
 """Nearer than this the sensor's own parallax and saturation decide."""
 DOMINATES = 0.9
 """Share of a zone's light from which on the object counts as what the zone sees."""
-MODEL_ERROR = ModelError(0.05, 0.01)
 POSES = (1, 4, 8, 16)
 FREE = ("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad", "support")
 INSIDE_95 = 12.592
 """95 % quantile of χ² with six degrees of freedom."""
-SYSTEMATIC = (0.6e-3, np.radians(0.35))
-"""What is common to all poses of an object and no number of them averages: metres, radians."""
 
 
 def simulate(folder: Path, rng: np.random.Generator) -> None:
@@ -96,8 +103,8 @@ def _pose(rng: np.random.Generator) -> NDArray[np.float64]:
     return pose
 
 
-def read(folder: Path) -> tuple[PlaneRecording, list[ObjectRecording]]:
-    """Return the plane and the objects of a folder, as the preset's zones."""
+def read_plane(folder: Path) -> PlaneRecording:
+    """Return the plane of a folder, as the preset's zones."""
     base = preset("tmf8820-3x3")
     log = read_histograms(folder / "ladder.npz", sensor=base)
     if log.frames.reference is not None:
@@ -105,6 +112,11 @@ def read(folder: Path) -> tuple[PlaneRecording, list[ObjectRecording]]:
         base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
         log = read_histograms(folder / "ladder.npz", sensor=base)
     far = np.flatnonzero(log.distance_m >= NEAREST_M)
+    return PlaneRecording(log.frames[far], log.distance_m[far])
+
+
+def read_objects(folder: Path, base: Sensor) -> list[ObjectRecording]:
+    """Return the objects of a folder, as a sensor's zones."""
     objects = []
     for path in sorted(folder.glob("*.stl")):
         mesh = trimesh.load(path)
@@ -112,7 +124,7 @@ def read(folder: Path) -> tuple[PlaneRecording, list[ObjectRecording]]:
         objects.append(
             ObjectRecording(path.stem, own.frames, label_object(mesh, support_height(mesh)), own.sensor2world)
         )
-    return PlaneRecording(log.frames[far], log.distance_m[far]), objects
+    return objects
 
 
 def split(n: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -141,50 +153,57 @@ def draw_histograms(fit: DirectFit, objects: list[ObjectRecording], path: Path) 
 
 
 def locate(
-    fit: DirectFit, one: ObjectRecording, rig: NDArray[np.float64], draws: int, rng: np.random.Generator
-) -> list[dict[str, float]]:
-    """Return errors of an object's pose from k poses that the fit has not seen, against the arm and the rig."""
-    p = fit.parameters
-    poses = one.sensor2world.copy()
-    poses[:, :3, 3] += p["forward"] * poses[:, :3, 2]
+    fit: DirectFit, found: PoseCalibration, one: ObjectRecording, rest: NDArray[np.int64], name: str | None, draws: int,
+    rng: np.random.Generator,
+) -> list[dict[str, float]]:  # fmt: skip
+    """Return errors of an object's pose from k poses that the fit has not seen, against where it should stand."""
+    poses, place = fit.optical_poses(one.sensor2world), found.place(name)
     frames = HistogramFrames(one.frames.counts, sensor=fit.sensor, reference=one.frames.reference)
     scene = ObjectScene(one.mesh, fit.sensor)
-    support = p[f"{one.name}_support"]
-    # one linearisation at the arm's pose serves all draws: errors are far smaller than a bin
-    linear = scene.linearise(frames, poses, rig, support, FREE)
-    evidence = evidence_of(linear, frames.zone_counts, MODEL_ERROR)
+    # one linearisation at that place serves all draws: errors are far smaller than a bin
+    linear = scene.linearise(frames, poses, place, fit.parameters[f"{one.name}_support"], FREE)
+    evidence = evidence_of(linear, frames.zone_counts, ModelError(0.05, 0.01))
     poisson = evidence_of(linear, frames.zone_counts)
-    rest = split(len(poses))[1]
     table = []
     for k in POSES:
         error, spread, inside, bound = [], [], [], []
         for _ in range(draws):
             chosen = rng.choice(rest, k, replace=False)
-            step, covariance = solve_jointly(evidence.of_poses(chosen), robust=True)
-            covariance = np.nan_to_num(covariance[:6, :6], posinf=1e6) + np.diag(
-                [SYSTEMATIC[0] ** 2] * 3 + [SYSTEMATIC[1] ** 2] * 3
-            )
-            error.append(step[:6])
+            seen = evidence.of_poses(chosen)
+            step = solve_jointly(seen)[0][:6]
+            covariance = np.nan_to_num(pose_covariance(seen, calibration=found, name=name)[0][:6, :6], posinf=1e6)
+            error.append(step)
             spread.append(np.sqrt([np.trace(covariance[:3, :3]), np.trace(covariance[3:, 3:])]))
             bound.append(np.trace(solve_jointly(poisson.of_poses(chosen))[1][:3, :3]))
-            inside.append(step[:6] @ np.linalg.pinv(covariance) @ step[:6] <= INSIDE_95)
+            inside.append(step @ np.linalg.solve(covariance, step) <= INSIDE_95)
         shift = 1e3 * np.linalg.norm(np.array(error)[:, :3], axis=1)
         turn = np.degrees(np.linalg.norm(np.array(error)[:, 3:], axis=1))
+        stated = np.median(spread, axis=0)
         table.append({
             "poses": k, "median_mm": float(np.median(shift)), "p90_mm": float(np.quantile(shift, 0.9)),
             "median_deg": float(np.median(turn)), "p90_deg": float(np.quantile(turn, 0.9)),
-            "predicted_mm": float(1e3 * np.median([s[0] for s in spread])),
+            "predicted_mm": float(1e3 * stated[0]), "predicted_deg": float(np.degrees(stated[1])),
             "inside_95": float(np.mean(inside)), "bound_mm": float(1e3 * np.sqrt(np.median(bound))),
         })  # fmt: skip
-    chosen = rng.choice(rest, POSES[1], replace=False)
-    start = rig + np.array([0.004, -0.004, 0.003, 0, 0, 0.04])
-    whole = match_jointly(frames[chosen], poses[chosen], scene, start=start, support=1.0, systematic=SYSTEMATIC)
-    off = whole.displacement - rig
+    return table
+
+
+def search(
+    fit: DirectFit, found: PoseCalibration, one: ObjectRecording, rest: NDArray[np.int64], rng: np.random.Generator
+) -> None:
+    """Print what a search from 6 mm and 2° away finds with a few poses."""
+    chosen, place = rng.choice(rest, min(POSES[1], len(rest)), replace=False), found.place(one.name)
+    frames = HistogramFrames(one.frames.counts, sensor=fit.sensor, reference=one.frames.reference)
+    whole = match_jointly(
+        frames[chosen], fit.optical_poses(one.sensor2world[chosen]), ObjectScene(one.mesh, fit.sensor),
+        start=place + np.array([0.004, -0.004, 0.003, 0, 0, 0.04]), calibration=found, name=one.name,
+    )  # fmt: skip
+    off = whole.displacement - place
     print(
-        f"{one.name}: searched from 6 mm and 2° away with {POSES[1]} poses: {1e3 * np.linalg.norm(off[:3]):.1f} mm,"
+        f"{one.name}: searched from 6 mm and 2° away with {len(chosen)} poses: {1e3 * np.linalg.norm(off[:3]):.1f} mm,"
         f" {np.degrees(np.linalg.norm(off[3:])):.1f}° in {whole.steps} steps, chi2/dof {whole.chi2 / whole.dof:.2f}"
     )
-    return table
+    print("  1 sigma of x by term (mm):", {key: round(1e3 * t[0, 0] ** 0.5, 2) for key, t in whole.terms.items()})
 
 
 def draw_errors(tables: dict[str, list[dict[str, float]]], path: Path) -> None:
@@ -209,7 +228,7 @@ def main(arguments: list[str] | None = None) -> dict[str, object]:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--data", type=Path, help="folder of logs; without it a recording is simulated")
     parser.add_argument("--out", type=Path, required=True, help="folder for pictures and numbers")
-    parser.add_argument("--top", action="append", default=[], metavar="NAME=M", help="how much higher an object is")
+    parser.add_argument("--others", type=Path, help="folder of other recordings of the objects, to be located")
     parser.add_argument("--rounds", type=int, default=3, help="how often geometry and response are fitted in turn")
     parser.add_argument("--draws", type=int, default=200, help="random draws of poses")
     options = parser.parse_args(arguments)
@@ -220,10 +239,13 @@ def main(arguments: list[str] | None = None) -> dict[str, object]:
         folder = options.out / "simulated"
         folder.mkdir(exist_ok=True)
         simulate(folder, rng)
-    plane, objects = read(folder)
+    plane = read_plane(folder)
+    objects = read_objects(folder, plane.frames.sensor)
+    seen = [np.arange(len(one.frames)) if options.others else split(len(one.frames))[0] for one in objects]
+    calibrating = [one[k] for one, k in zip(objects, seen, strict=True)]
     every_second = np.arange(0, len(plane.frames), 2)
     fit = fit_direct_sensor(
-        plane[every_second], [one[split(len(one.frames))[0]] for one in objects], base=plane.frames.sensor,
+        plane[every_second], calibrating, base=plane.frames.sensor,
         rounds=options.rounds,
     )  # fmt: skip
     unseen = plane[every_second[: len(plane.frames) // 2] + 1]
@@ -238,19 +260,21 @@ def main(arguments: list[str] | None = None) -> dict[str, object]:
         found[f"{one.name}_centroid_mm"] = {"median": float(np.median(off)), "mad": mad, "n": len(off)}
         print(f"{one.name}: centroid of {len(off)} unseen zones: median {np.median(off):.2f} mm, MAD {mad:.2f} mm")
     draw_histograms(fit, objects, options.out / "histograms.png")
-    rig = np.zeros(6)
-    places = [[fit.parameters[f"{one.name}_{axis}"] for axis in ("x", "y", "z", "yaw")] for one in objects]
-    rig[[0, 1, 2, 5]] = np.mean(places, axis=0)
-    raised = {name: float(value) for name, _, value in (text.partition("=") for text in options.top)}
-    mean_raise = float(np.mean([raised.get(one.name, 0.0) for one in objects]))
-    tables = {}
-    for one in objects:
-        own = rig + np.array([0, 0, raised.get(one.name, 0.0) - mean_raise, 0, 0, 0])
-        tables[one.name] = locate(fit, one, own, options.draws, rng)
-        for row in tables[one.name]:
-            print(one.name, {key: round(value, 2) for key, value in row.items()})
-    draw_errors(tables, options.out / "error.png")
-    found["poses"] = tables
+    calibration = calibrate_poses(fit, calibrating)
+    errors = calibration.errors.as_fields()
+    print("errors of the model, the arm and the mesh:", errors, f"sides left out: {calibration.left_out:.2f}")
+    found["errors"] = {**errors, "left_out": calibration.left_out}
+    known: dict[str, list[dict[str, float]]] = {}
+    another: dict[str, list[dict[str, float]]] = {}
+    for one in objects if options.others is None else read_objects(options.others, plane.frames.sensor):
+        rest = split(len(one.frames))[1] if options.others is None else np.arange(len(one.frames))
+        search(fit, calibration, one, rest, rng)
+        for name, tables in ((one.name, known), (None, another)):
+            tables[one.name] = locate(fit, calibration, one, rest, name, options.draws, rng)
+            for row in tables[one.name]:
+                print(one.name, "known" if name else "as another", {key: round(x, 2) for key, x in row.items()})
+    draw_errors(known, options.out / "error.png")
+    found |= {"poses": known, "poses_of_another": another}
     (options.out / "direct_sensor.json").write_text(json.dumps(found, indent=1), encoding="utf-8")
     return found
 

@@ -9,7 +9,9 @@ from oracles.simple_scenes import block_on_table, poses_around
 from scipy.stats import chi2, norm
 
 from phasemark import UsageError
-from phasemark.matcher.histograms.object_pose import POISSON, Evidence, evidence_of, match_jointly, solve_jointly
+from phasemark.matcher.histograms.object_pose import match_jointly
+from phasemark.matcher.histograms.pose_errors import NO_ERRORS
+from phasemark.matcher.histograms.pose_evidence import Evidence, evidence_of, solve_jointly
 from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, ObjectScene
 from phasemark.matcher.statistics import nees
 from phasemark.render import preset
@@ -54,7 +56,7 @@ def judge(n: int, seed: int) -> tuple[np.ndarray, float]:
     found = [
         match_jointly(
             HistogramFrames(drawn.counts[:, k : k + 1], sensor=DIM), poses, DIM_SCENE, start=start, free=FREE,
-            support=SUPPORT, model_error=POISSON,
+            support=SUPPORT, errors=NO_ERRORS,
         )
         for k in range(n)
     ]  # fmt: skip
@@ -81,7 +83,7 @@ def test_error_over_bound_and_nees_hold_their_bars_in_5000_trials() -> None:
 def test_one_estimate_from_all_six_numbers_is_near_the_truth_and_accepted() -> None:
     poses, truth = poses_around(6), np.array([0.003, -0.002, 0.004, 0.02, -0.015, 0.04])
     frames = capture_histograms(expected_at(SCENE, poses, truth), SENSOR, rng=np.random.default_rng(8))
-    found = match_jointly(frames, poses, SCENE, model_error=POISSON)
+    found = match_jointly(frames, poses, SCENE, errors=NO_ERRORS)
     std = np.sqrt(np.diag(found.covariance))
     error = np.append(found.displacement - truth, found.support - SUPPORT)
     assert (np.abs(error) < 5 * std + 1e-6).all()
@@ -145,12 +147,12 @@ def test_two_sensors_on_one_mount_know_the_object_as_their_information_together(
     seen = list(zip(scenes, both, strict=True))
     frames = [capture_histograms(expected_at(scene, at, TRUTH), scene.sensor, rng=rng) for scene, at in seen]
     evidence = [evidence_at(scene, at, TRUTH) for scene, at in seen]
-    found = match_jointly(frames, both, scenes, start=TRUTH, free=FREE, support=SUPPORT, model_error=POISSON)
+    found = match_jointly(frames, both, scenes, start=TRUTH, free=FREE, support=SUPPORT, errors=NO_ERRORS)
     summed = sum(one.information.sum(axis=(0, 1)) for one in evidence)
     _, bound = solve_jointly(Evidence.joined(evidence))
     np.testing.assert_allclose(bound, np.linalg.inv(summed), rtol=1e-9)
     np.testing.assert_allclose(found.covariance, bound, rtol=0.1)  # taken at the estimate, not at the truth
     assert (np.abs(found.displacement - TRUTH)[WHERE] < 5 * np.sqrt(np.diag(bound))).all()
     assert found.accepted
-    alone = match_jointly(frames[0], poses, scenes[0], start=TRUTH, free=FREE, support=SUPPORT, model_error=POISSON)
+    alone = match_jointly(frames[0], poses, scenes[0], start=TRUTH, free=FREE, support=SUPPORT, errors=NO_ERRORS)
     assert (np.diag(found.covariance) < np.diag(alone.covariance)).all()

@@ -585,6 +585,8 @@ def test_the_zone_sensor_is_fitted_and_objects_are_located_by_histograms(tmp_pat
         assert rows[16]["median_mm"] < 1.0
         assert rows[16]["median_mm"] < rows[1]["median_mm"]
         assert rows[16]["bound_mm"] < rows[4]["bound_mm"] < rows[1]["bound_mm"]
+        assert min(row["inside_95"] for row in rows.values()) >= 0.8  # 20 draws from one calibration
+        assert rows[16]["predicted_mm"] < found["poses_of_another"][name][-1]["predicted_mm"]
     assert {path.name for path in tmp_path.glob("*.png")} == {"histograms.png", "error.png"}
 
 

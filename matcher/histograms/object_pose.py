@@ -1,8 +1,7 @@
 """The pose of a known object from several histograms, by maximum likelihood, with covariance and χ² (PHYSICS 7, 11).
 
-Counts are Poisson, so a residual is weighted with 1/λ and the information is Σ_j ∂λ_j ∂λ_jᵀ / λ_j. Brightness and
-ambient light of every histogram are free and are projected out. What the model itself may be off (:class:`ModelError`)
-adds to the variance, and the covariance is then taken from the scatter of the histograms.
+The evidence is that of :mod:`~phasemark.matcher.histograms.pose_evidence`, the covariance holds what
+:mod:`~phasemark.matcher.histograms.pose_errors` describes beside noise.
 """
 
 from __future__ import annotations
@@ -13,41 +12,26 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
 from scipy.stats import chi2
 
 from phasemark import UsageError
 from phasemark.matcher.estimate.solver import descend
-from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, Linearised, ObjectScene, displaced
+from phasemark.matcher.histograms.pose_calibration import PoseCalibration
+from phasemark.matcher.histograms.pose_errors import ASSUMED_ERRORS, NO_ERRORS, Contrast, PoseErrors
+from phasemark.matcher.histograms.pose_evidence import (
+    FITTED,
+    POISSON,
+    Evidence,
+    evidence_of,
+    gauss_newton,
+    largest_steps,
+)
+from phasemark.matcher.histograms.scene_prediction import POSE_PARAMETERS, ObjectScene, displaced
 from phasemark.render.direct.histogram_frames import HistogramFrames
 
 _MOST_STEPS = 12
 _DONE = 1e-4  # squared standard deviations: what is left of a search that converges quadratically is far less
 _SHARES = (1.0, 1 / 3, 1 / 9)
-_LARGEST_STEP = {"m": 0.02, "rad": 0.15}
-_WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
-
-
-class ModelError(NamedTuple):
-    """Errors of a sensor's model, as standard deviations of expected counts.
-
-    Parameters
-    ----------
-    count_share : float
-        Standard deviation of an expected count, as a share of it.
-    peak_share : float
-        The same as a share of the histogram's highest count, in every bin.
-    """
-
-    count_share: float = 0.0
-    peak_share: float = 0.0
-
-
-MEASURED_ERROR = ModelError(0.05, 0.01)
-"""What a fitted TMF8820 was off before two objects at poses that were not fitted."""
-
-POISSON = ModelError()
-"""Poisson noise alone."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +59,9 @@ class ObjectPose:
         Whether χ² is one that the object at this pose makes, at the given false-alarm rate.
     steps : int
         Steps of the search.
+    terms : dict of str to (p, p) float64
+        Parts of the covariance: "model" (noise and what histograms err each for itself), "pose" (the arm), "side" (what
+        poses from one side share), "hand" (hand-eye transform) and "object" (mesh).
     """
 
     displacement: NDArray[np.float64]
@@ -86,6 +73,7 @@ class ObjectPose:
     dof: int
     accepted: bool
     steps: int
+    terms: dict[str, NDArray[np.float64]]
 
     @property
     def p_value(self) -> float:
@@ -102,114 +90,9 @@ class ObjectPose:
             "displacement": dict(zip(POSE_PARAMETERS, self.displacement.tolist(), strict=True)),
             "free": list(self.free),
             "covariance": self.covariance.tolist(),
+            "terms": {name: term.tolist() for name, term in self.terms.items()},
             **{name: getattr(self, name) for name in ("support", "chi2", "dof", "p_value", "accepted")},
         }
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Information and gradient of every histogram about one object pose.
-
-    Parameters
-    ----------
-    information : (n, zones, p, p) float64
-        Fisher information in the free parameters.
-    gradient : (n, zones, p) float64
-        Gradient of the log-likelihood by them.
-    chi2 : (n, zones) float64
-        Whitened squared residuals of each histogram.
-    dof : (n, zones) int
-        Degrees of freedom of each.
-    """
-
-    information: NDArray[np.float64]
-    gradient: NDArray[np.float64]
-    chi2: NDArray[np.float64]
-    dof: NDArray[np.int64]
-
-    def of_poses(self, poses: NDArray[np.integer]) -> Evidence:
-        """Return the evidence of some sensor poses."""
-        return Evidence(self.information[poses], self.gradient[poses], self.chi2[poses], self.dof[poses])
-
-    @classmethod
-    def joined(cls, parts: Sequence[Evidence]) -> Evidence:
-        """Return the evidence of several sensors, each histogram as a pose of one zone; (n · zones, 1, …)."""
-        flat = [
-            [values.reshape(-1, 1, *values.shape[2:]) for values in (one.information, one.gradient, one.chi2, one.dof)]
-            for one in parts
-        ]
-        return cls(*(np.concatenate(columns) for columns in zip(*flat, strict=True)))
-
-
-def evidence_of(linear: Linearised, measured: NDArray[np.float64], model_error: ModelError = POISSON) -> Evidence:
-    """Return what histograms tell about an object pose, brightness and ambient light of each projected out.
-
-    Parameters
-    ----------
-    linear : Linearised
-        Expected counts at the pose, and their slopes.
-    measured : (n, zones, bins) float64
-        Counts.
-    model_error : ModelError
-        Errors of the model beside the noise.
-    """
-    expected = linear.expected
-    peak = expected.max(axis=-1, keepdims=True)
-    variance = expected + (model_error.count_share * expected) ** 2 + (model_error.peak_share * peak) ** 2
-    root = 1 / np.sqrt(variance)
-    residual = (measured - expected) * root
-    slope = linear.slope * root[..., None]
-    nuisance = np.stack([linear.brightness * root, root], axis=-1)
-    q, _ = np.linalg.qr(nuisance)
-    residual = residual - np.einsum("nzbk,nzk->nzb", q, np.einsum("nzbk,nzb->nzk", q, residual))
-    slope = slope - np.einsum("nzbk,nzkp->nzbp", q, np.einsum("nzbk,nzbp->nzkp", q, slope))
-    information = np.einsum("nzbp,nzbq->nzpq", slope, slope, optimize=True)
-    gradient = np.einsum("nzbp,nzb->nzp", slope, residual)
-    chi2_of = (residual**2).sum(axis=2)
-    return Evidence(information, gradient, chi2_of, np.full(residual.shape[:2], residual.shape[2] - 2))
-
-
-def solve_jointly(
-    evidence: Evidence, scales: NDArray[np.float64] | None = None, *, robust: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the Gauss-Newton step of all poses together, and its covariance.
-
-    Parameters
-    ----------
-    evidence : Evidence
-        The recorded histograms.
-    scales : (p,) float64, optional
-        Size of a step of each parameter; None: 1.
-    robust : bool
-        Whether the covariance is taken from how far the histograms' gradients scatter (H⁻¹ Σ g gᵀ H⁻¹, each histogram
-        for itself) rather than from the information alone: for models that are off by more than noise. For few
-        histograms it is so much larger that its 95 % ellipsoid is that of Hotelling's T².
-
-    Returns
-    -------
-    step : (p,) float64
-        0 along directions that nothing tells.
-    covariance : (p, p) float64
-        Infinite for parameters that an undetermined direction involves.
-    """
-    p = evidence.gradient.shape[-1]
-    parts, gradients = evidence.information.reshape(-1, p, p), evidence.gradient.reshape(-1, p)
-    information, gradient = parts.sum(axis=0), gradients.sum(axis=0)
-    unit = np.ones(p) if scales is None else scales
-    values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-    weak = values <= _WEAK * max(values.max(initial=0.0), 1e-300)
-    inverse = np.where(weak, 0.0, 1 / np.where(weak, 1.0, values))
-    covariance = (vectors * inverse) @ vectors.T * np.outer(unit, unit)
-    step = covariance @ gradient
-    if robust:
-        left = gradients - parts @ step
-        n = int((evidence.chi2 > 0).sum())
-        scatter = left.T @ left * (n / max(n - p, 1))
-        covariance = covariance @ scatter @ covariance * _small_sample(n, p)
-    if weak.any():
-        blind = (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
-        covariance[blind, blind] = np.inf
-    return step, covariance
 
 
 def match_jointly(
@@ -217,11 +100,12 @@ def match_jointly(
     sensor2world: ArrayLike | Sequence[ArrayLike],
     scene: ObjectScene | Sequence[ObjectScene],
     *,
-    start: ArrayLike = (0.0,) * 6,
+    start: ArrayLike | None = None,
     free: Sequence[str] = (*POSE_PARAMETERS, "support"),
     support: float = 1.0,
-    model_error: ModelError = MEASURED_ERROR,
-    systematic: tuple[float, float] = (0.0, 0.0),
+    errors: PoseErrors | None = None,
+    calibration: PoseCalibration | None = None,
+    name: str | None = None,
     false_alarm: float = 0.01,
 ) -> ObjectPose:
     """Estimate the pose of an object from histograms of several sensor poses together, of one sensor or of several.
@@ -234,17 +118,19 @@ def match_jointly(
         Pose of the optical frame at each position. Sensors on one mount have its pose times that of the sensor on it.
     scene : ObjectScene, or a sequence of them
         The same object, for each sensor.
-    start : (6,) array_like
-        Initial guess of the displacement; within about a bin and ten degrees.
+    start : (6,) array_like, optional
+        Initial guess of the displacement; within about a bin and ten degrees. None: the place of the calibration, or 0.
     free : sequence of str
         What is estimated.
     support : float
         Initial guess of the support's albedo over the object's.
-    model_error : ModelError
-        What the model may be off; `POISSON`: nothing.
-    systematic : (float, float)
-        Standard deviations, metres and radians, of what is common to all poses and noise does not explain: the frame
-        of the arm, the calibration. Added to the covariance.
+    errors : PoseErrors, optional
+        Errors beside noise; `NO_ERRORS`: none. None: those of the calibration, or those that the sensor states, or
+        `ASSUMED_ERRORS`.
+    calibration : PoseCalibration, optional
+        Of the sensor: the covariance is then that of the difference from its :meth:`~PoseCalibration.place`.
+    name : str, optional
+        Object of the calibration, which has not been moved.
     false_alarm : float
         Probability that the object itself is refused.
 
@@ -262,27 +148,64 @@ def match_jointly(
     sensors = _by_sensor(frames, sensor2world, scene)
     if not 0 < false_alarm < 1:
         raise UsageError(f"'false_alarm' must lie between 0 and 1, got {false_alarm!r}")
+    if calibration is None and name is not None:
+        raise UsageError(f"'name' must be left out without a calibration, got {name!r}")
+    if calibration is not None and errors is not None:
+        raise UsageError("'errors' must be left out with a calibration, which has its own")
+    if start is None:
+        start = np.zeros(6) if calibration is None else calibration.place(name)
+    if calibration is None and errors is None:
+        errors = PoseErrors.of(sensors[0][2].histogram) or ASSUMED_ERRORS
     move = np.array(start, dtype=np.float64)
     if move.shape != (6,):
         raise UsageError(f"'start' must have 6 numbers, got {move.shape}")
-    limits = np.array([_LARGEST_STEP.get(name.rpartition("_")[2], 1.0) for name in free])
+    weights = POISSON if errors == NO_ERRORS else FITTED
 
     def at(values: NDArray[np.float64], ratio: float) -> _Supposed:
         parts = [
-            evidence_of(one.linearise(seen, poses, values, ratio, free), seen.zone_counts, model_error)
+            evidence_of(one.linearise(seen, poses, values, ratio, free), seen.zone_counts, weights)
             for seen, poses, one in sensors
         ]
         return _Supposed(at, tuple(free), values, ratio, parts[0] if len(parts) == 1 else Evidence.joined(parts))
 
+    limits = largest_steps(free)
     here, _, steps = descend(at(move, support), limits, most=_MOST_STEPS, done=_DONE, shares=_SHARES)
-    _, covariance = solve_jointly(here.evidence, limits, robust=model_error != POISSON)
-    common = {"m": systematic[0], "rad": systematic[1]}
-    covariance = covariance + np.diag([common.get(name.rpartition("_")[2], 0.0) ** 2 for name in free])
+    covariance, terms = pose_covariance(here.evidence, errors, calibration, name)
     dof = int(here.evidence.dof.sum()) - len(free)
     return ObjectPose(
         here.displacement, sensors[0][2].moved(here.displacement), here.free, covariance, here.support, here.cost, dof,
-        bool(chi2.sf(here.cost, dof) > false_alarm), steps,
+        bool(chi2.sf(here.cost, dof) > false_alarm), steps, terms,
     )  # fmt: skip
+
+
+def pose_covariance(
+    evidence: Evidence,
+    errors: PoseErrors | None = None,
+    calibration: PoseCalibration | None = None,
+    name: str | None = None,
+) -> tuple[NDArray[np.float64], dict[str, NDArray[np.float64]]]:
+    """Return the covariance of a joint estimate, infinite for what nothing tells, and its terms.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    errors, calibration, name
+        As for :func:`match_jointly`, one of the first two given.
+    """
+    if calibration is not None:
+        terms = calibration.error_terms(evidence, name)
+    else:
+        assert errors is not None
+        estimate = Contrast.estimate(evidence)
+        lever, places = estimate.hand(), estimate.places
+        terms = estimate.terms(errors) | {
+            "hand": lever @ errors.covariance_of("hand") @ lever.T,
+            "object": places @ errors.covariance_of("object") @ places.T,
+        }
+    covariance = np.asarray(sum(terms.values()))
+    blind = gauss_newton(evidence)[2]
+    covariance[blind, blind] = np.inf
+    return covariance, terms
 
 
 class _Supposed(NamedTuple):
@@ -333,11 +256,3 @@ def _by_sensor(
         if not np.allclose(one.centre_m, scene[0].centre_m, rtol=0, atol=1e-9):
             raise UsageError(f"'scene' must hold one object: that of sensor {k} is turned about another point")
     return list(zip(frames, poses, scene, strict=True))
-
-
-def _small_sample(n: int, p: int) -> float:
-    """Return by what a covariance grows that n values tell, so that its 95 % ellipsoid is that of Hotelling's T²."""
-    nu = max(n - p, 1)
-    left = max(nu - p + 1, 1)
-    limit = p * nu / left * special.fdtri(p, left, 0.95)
-    return float(limit / special.chdtri(p, 0.05))

@@ -39,11 +39,21 @@ class Linearised(NamedTuple):
         ∂expected/∂parameter at fixed brightness.
     brightness : (n, zones, bins) float64
         ∂expected/∂ln brightness.
+    free : tuple of str
+        The parameters.
+    direction : (n, 3) float64
+        From the object's centre to the sensor, unit vectors.
+    lever : (n, 6, 6) float64
+        By how much the object seems displaced where the sensor stands or looks otherwise than its pose says: in the
+        order of `POSE_PARAMETERS`, by metres along the axes of the optical frame and radians about them.
     """
 
     expected: NDArray[np.float64]
     slope: NDArray[np.float64]
     brightness: NDArray[np.float64]
+    free: tuple[str, ...]
+    direction: NDArray[np.float64]
+    lever: NDArray[np.float64]
 
 
 class ObjectScene:
@@ -142,7 +152,17 @@ class ObjectScene:
         expected = piled(bright * here)
         brighter = (piled(bright * here * 1.001) - expected) / 0.001
         slope = np.stack(slopes, axis=-1) if slopes else np.zeros((*expected.shape, 0))
-        return Linearised(expected, slope, brighter)
+        to_centre = self.centre_m + move[:3] - poses[:, :3, 3]
+        direction = -to_centre / np.linalg.norm(to_centre, axis=1, keepdims=True)
+        return Linearised(expected, slope, brighter, tuple(free), direction, _lever(poses[:, :3, :3], to_centre))
+
+
+def _lever(axes: NDArray[np.float64], to_centre: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how far an object seems displaced by errors of the sensor's place and turn, (n, 6, 6)."""
+    out = np.zeros((len(axes), 6, 6))
+    out[:, :3, :3] = out[:, 3:, 3:] = -axes
+    out[:, :3, 3:] = np.cross(to_centre[:, None], axes.transpose(0, 2, 1)).transpose(0, 2, 1)
+    return out
 
 
 def displaced(

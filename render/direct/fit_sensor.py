@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares, minimize_scalar
 
 from phasemark import UsageError
@@ -78,6 +78,12 @@ class DirectFit:
     def predict(self, recording: PlaneRecording | ObjectRecording) -> Prediction:
         """Return expected and measured histograms of a recording."""
         return self.model.predict(self.parameters, self.responses, recording)
+
+    def optical_poses(self, sensor2world: ArrayLike) -> NDArray[np.float64]:
+        """Return stated poses moved forward to where the zones' common origin was found, (n, 4, 4)."""
+        poses = np.array(sensor2world, dtype=np.float64)
+        poses[:, :3, 3] += self.parameters["forward"] * poses[:, :3, 2]
+        return poses
 
     def plane_range_m(self, plane: PlaneRecording) -> NDArray[np.float64]:
         """Return the distance of a plane that each zone's histogram alone tells best, (n, zones)."""

@@ -92,6 +92,21 @@ class Histogram(FieldTable):
         Least distance of two targets of one zone.
     reports : {"range", "z"}
         Whether the chip reports ranges along the ray or converts them to z.
+    error_scale : float
+        Scatter of histograms over what noise and the tolerance of a fit expect. 0: no errors are stated.
+    error_zone_m : float
+        Standard deviation of what each histogram errs for itself, as a displacement of an object, each component; the
+        next ones too.
+    error_pose_m, error_pose_deg : float
+        Of the pose that an arm states, each for itself.
+    error_side_m, error_side_deg : float
+        Of what poses share that look from one side.
+    error_side_reach_deg : float
+        Angle between directions over which that changes.
+    error_hand_m, error_hand_deg : float
+        Of the hand-eye transform.
+    error_object_m, error_object_deg : float
+        Of an object's mesh: dimensions and place.
 
     Raises
     ------
@@ -130,6 +145,17 @@ class Histogram(FieldTable):
     threshold: Annotated[float, Field(gt=0, le=1e6)] = 5.0
     min_separation_m: _NonNegative = 0.0
     reports: Literal["range", "z"] = "range"
+    error_scale: _NonNegative = 0.0
+    error_zone_m: _NonNegative = 0.0
+    error_pose_m: _NonNegative = 0.0
+    error_pose_deg: _NonNegative = 0.0
+    error_side_m: _NonNegative = 0.0
+    error_side_deg: _NonNegative = 0.0
+    error_side_reach_deg: Annotated[float, Field(gt=0, le=180)] = 30.0
+    error_hand_m: _NonNegative = 0.0
+    error_hand_deg: _NonNegative = 0.0
+    error_object_m: _NonNegative = 0.0
+    error_object_deg: _NonNegative = 0.0
 
     @classmethod
     def _refusal(cls, first: ErrorDetails) -> UsageError:
