@@ -117,6 +117,8 @@ def test_tilts_before_a_wide_panel_are_known_or_free_with_a_coarse_bank(bank):
     assert scaled_errors(exact, views).sum() < stats.chi2.ppf(1 - 1e-3, 2 * n)
     ignored = Matcher(bank, "refine", **options).match(frames)
     assert ignored.accepted.mean() < 0.25  # those that are hardly tilted
+    wrong = replace(frames, tilt_rad=np.full((n, 2), -0.3))
+    assert not Matcher(bank, "refine", **options).match(wrong).accepted.any()
     std = 0.5 * DEGREE
     off = tilt + std * np.random.default_rng(4).standard_normal((n, 2))
     options |= {"free": ("distance_m", "delta_rad", "pitch_rad", "roll_rad"), "pitch_std_rad": std, "roll_std_rad": std}

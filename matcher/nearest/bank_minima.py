@@ -293,7 +293,7 @@ class Search:
 
     def levelled(self, seen: Observation) -> Observation:
         """Return frames as a level camera would see them: each pixel what a frame shows along its ray."""
-        if self._tilt_rad is None:
+        if self._tilt_rad is None or not len(seen.returned):
             return seen
         sensor, parts = self._sensor, []
         v, u = np.mgrid[: sensor.rows, : sensor.cols]
