@@ -35,11 +35,8 @@ _OBJECT, _OBJECTS_WORTH = (1e-3, math.radians(0.5)), 3
 """Dimensions and place of a mesh, stated: a printed object measured in place by hand."""
 _HAND = (5e-3, math.radians(2))
 """Hand-eye transform before a calibration, stated."""
-_SIDES = 4
-_MOST_POSES = 32
 _SIZES = ("scale", "zone_m", "pose_m", "pose_rad", "side_m", "side_rad", "side_reach_rad")
 _START = (2.0, 0.4e-3, 0.1e-3, math.radians(0.1), 0.4e-3, math.radians(0.4), math.radians(40))
-_REACH_SPREAD = 0.5  # of the logarithm of the reach, about its start
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,9 +177,9 @@ def _known(fit: DirectFit, one: ObjectRecording) -> KnownObject:
 
 
 def _thinned(evidence: Evidence) -> Evidence:
-    """Return evidence of at most `_MOST_POSES` poses, spread over all."""
-    n = len(evidence.dof)
-    return evidence.of_poses(np.unique(np.linspace(0, n - 1, min(n, _MOST_POSES)).round().astype(int)))
+    """Return evidence of at most 32 poses, spread over all."""
+    n, most = len(evidence.dof), 32
+    return evidence.of_poses(np.unique(np.linspace(0, n - 1, min(n, most)).round().astype(int)))
 
 
 def _whitened(evidence: Evidence, seen: Contrast, errors: PoseErrors) -> tuple[_Float, _Float, _Float, float]:
@@ -202,13 +199,14 @@ def _whitened(evidence: Evidence, seen: Contrast, errors: PoseErrors) -> tuple[_
 def _likeliest(every: Sequence[Evidence]) -> PoseErrors:
     """Return the sizes of the greatest restricted likelihood."""
     start = np.array(_START)
+    reach_spread = 0.5  # of the logarithm of the reach, about its start
     parts = [(one, Contrast.estimate(one)) for one in every]
 
     def sizes(x: _Float) -> PoseErrors:
         return PoseErrors(**dict(zip(_SIZES, (start * np.exp(x)).tolist(), strict=True)))
 
     def cost(x: _Float) -> float:
-        total = (x[-1] / _REACH_SPREAD) ** 2 / 2 + 1e-3 * float(x @ x)
+        total = (x[-1] / reach_spread) ** 2 / 2 + 1e-3 * float(x @ x)
         for one, seen in parts:
             slope, _, pull, log_det = _whitened(one, seen, sizes(x))
             matrix, gradient = slope.T @ slope, slope.T @ pull
@@ -233,14 +231,14 @@ def _hand_covariance(every: Sequence[Evidence], errors: PoseErrors) -> _Float:
 
 def _left_out(evidence: Evidence, errors: PoseErrors, hand: _Float) -> list[float]:
     """Return squared errors of each side against the other poses, over their expected value."""
-    apart = angles(evidence.direction)
+    apart, sides = angles(evidence.direction), 4
     middles = [int(apart.sum(axis=1).argmax())]
-    while len(middles) < _SIDES:
+    while len(middles) < sides:
         middles.append(int(apart[middles].min(axis=0).argmax()))
     side = apart[middles].argmin(axis=0)
     found = []
     least = 2  # poses that tell all numbers
-    for k in range(_SIDES):
+    for k in range(sides):
         out = side == k
         if out.sum() < least or (~out).sum() < least:
             continue

@@ -18,7 +18,6 @@ from phasemark.matcher.histograms.scene_prediction import Linearised
 from phasemark.render.direct.fit_model import FLOOR, PEAK_FLOOR
 
 _LARGEST_STEP = {"m": 0.02, "rad": 0.15}
-_WEAK = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
 
 
 class ModelError(NamedTuple):
@@ -167,7 +166,8 @@ def gauss_newton(
     information, gradient = evidence.information.sum(axis=(0, 1)), evidence.gradient.sum(axis=(0, 1))
     unit = largest_steps(evidence.free) if scales is None else scales
     values, vectors = np.linalg.eigh(information * np.outer(unit, unit))
-    weak = values <= _WEAK * max(values.max(initial=0.0), 1e-300)
+    least = 1e-10  # eigenvalue of the scaled information below which a direction is not observable
+    weak = values <= least * max(values.max(initial=0.0), 1e-300)
     inverse = np.where(weak, 0.0, 1 / np.where(weak, 1.0, values))
     covariance = (vectors * inverse) @ vectors.T * np.outer(unit, unit)
     return covariance @ gradient, covariance, (vectors[:, weak] ** 2).sum(axis=1) > 1e-6
