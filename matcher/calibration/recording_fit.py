@@ -632,7 +632,7 @@ class RecordingFit:
 
 
 def overdispersion_of(chi2: _Float, pixels: NDArray[np.int64]) -> float:
-    """Return by what share χ² of frames, (K,), scatters more about its mean than that of so many normal residuals.
+    """Return by what share χ² of frames, (K,), scatters more about its mean than that of normal residuals.
 
     0 where that may be chance: of K frames the variance of χ² is known to a share of √(2 / K).
     """
