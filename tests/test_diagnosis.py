@@ -17,6 +17,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
 from phasemark.matcher.diagnosis import Diagnosis
 from phasemark.matcher.diagnosis.search import _Seen
+from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.match import Candidate, Match
 from phasemark.render import Background, Frames, Renderer, capture, preset
 
@@ -221,8 +222,11 @@ def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_
     assert "diagnosis" not in json.loads(done.out)["matches"][0]
 
 
-def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys):
-    """Maximum likelihood, which a diagnosis tries, refuses what the nearest image takes: a panel as wide as this."""
+def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys, monkeypatch):
+    def fails(*_, **__):
+        raise UsageError("no images")
+
+    monkeypatch.setattr("phasemark.matcher.diagnose", fails)
     trimesh.creation.box((0.01, 4.0, 4.0)).export(tmp_path / "panel.stl")
     panel = MeshPlan(name="panel", path=str(tmp_path / "panel.stl"), unit="m")
     grid = {"distance_m": "0.4:1.0:0.2", "delta_deg": "-60:60:20", "layout": "full"}
@@ -238,7 +242,14 @@ def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys):
     assert not answer["accepted"]
     assert len(estimates.read_text().splitlines()) == 2
     *_, note = done.err.splitlines()
-    assert note.startswith("note: frame 0 is refused, and its diagnosis failed (UsageError: the bank ends at 1 m")
+    assert note.startswith("note: frame 0 is refused, and its diagnosis failed (UsageError: no images)")
+
+
+def test_pixels_without_a_known_noise_are_no_floor():
+    """Pixels that returned nothing have an infinite standard deviation."""
+    ranges = np.where(np.arange(64).reshape(8, 8) % 3, np.random.default_rng(1).uniform(0.2, 2.0, (8, 8)), np.nan)
+    frames = kalman_filter(Frames(ranges[None, None], sensor=preset("vl53l5cx-8x8")))
+    assert estimate_surroundings(frames).background.floor_m is None
 
 
 def test_what_a_landmark_in_few_pixels_leaves_open_is_said():

@@ -149,7 +149,7 @@ def _floor_in_rows(
     down = -ray[2]
     seen = np.isfinite(ranges) & (down > 0)
     drop, forward = np.where(seen, down * ranges, np.inf), ray[0] * ranges
-    tolerance = 4 * down * np.nan_to_num(std_m) + _ROUGHNESS_M
+    tolerance = 4 * down * np.nan_to_num(std_m, posinf=1e6) + _ROUGHNESS_M
     heights = np.sort(drop[seen & (drop > NEAREST_WALL_M)])
     best, on_floor = None, np.zeros(ranges.shape, np.bool_)
     for height in heights[:: max(1, len(heights) // _HEIGHTS)]:
