@@ -119,7 +119,7 @@ class PoseCalibration:
         return terms
 
     def _named(self, name: str | None) -> tuple[KnownObject, ...]:
-        found = tuple(one for one in self.objects if name in (None, one.name))
+        found = tuple(one for one in self.objects if name is None or one.name == name)
         if not found:
             raise UsageError(f"'name' must be one of {', '.join(one.name for one in self.objects)}, got {name!r}")
         return found
