@@ -142,7 +142,7 @@ def rendering_of(name: str, views: Views) -> dict[str, Any]:
     renderer = Renderer(build_mesh(catalog()[name]), SENSOR)
     speed = [1 / seconds_per_view(renderer, views, workers) for workers in (1, 2)]
     single = median_seconds(lambda: [renderer.render_views(views[k : k + 1]) for k in range(100)]) / 100
-    cast, spent, rays = renderer._intersector.first_face, 0.0, 0
+    cast, spent, rays = renderer._integral.intersector.first_face, 0.0, 0
 
     def timed(origins: Any, directions: Any) -> Any:
         nonlocal spent, rays
@@ -152,7 +152,7 @@ def rendering_of(name: str, views: Views) -> dict[str, Any]:
         rays += len(origins)
         return faces
 
-    renderer._intersector.first_face = timed  # type: ignore[method-assign]
+    renderer._integral.intersector.first_face = timed  # type: ignore[method-assign]
     started = time.perf_counter()
     renderer.render_views(views)
     total = time.perf_counter() - started

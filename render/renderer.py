@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import copy
-import hashlib
 import itertools
 import math
-from collections import OrderedDict
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from threading import Lock
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,122 +17,24 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background, Backgrounds, check_behind, parameters_of_views
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
-from phasemark.render.integral.image_rays import trace
+from phasemark.render.integral.area_integral import AreaIntegral, Slopes, Variant, images_of_sums, topology_of
+from phasemark.render.integral.arguments import Camera, Motion, Poses
 from phasemark.render.integral.intersect import make_intersector
-from phasemark.render.integral.lens_tables import distortion_of
-from phasemark.render.integral.light import add_background, points_a_side, sum_samples
-from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
-from phasemark.render.integral.pixel_splitting import Scratch
-from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, UNTRUSTED, plan_rays
-from phasemark.render.integral.shells import unite_shells
-from phasemark.render.integral.slopes import STEP, SlopeSums
+from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.ray_plan import UNTRUSTED
+from phasemark.render.integral.slopes import STEP
 from phasemark.render.integral.surface_mesh import SurfaceMesh
-from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.rigid import product
-from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
-Variant = Literal["exact", "hard"]
-"""The area integral, or what the centre ray of each pixel sees."""
-
-_SAMPLES = 1 << 17
-_RETURNS = 1 << 9
-_BORDERS = 1 << 14
-_LINKS = 1 << 10
-"""Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
 _LARGE = 1 << 13
 """Faces above which a mesh is more than the processor's cache holds."""
-
-
-@dataclass
-class _Buffers:
-    """Scratch of one thread; grows when a view needs more."""
-
-    n_edges: int
-    shape: tuple[int, int]
-    n_samples: int = _SAMPLES
-    n_links: int = 1 << 14
-    n_borders: int = 0
-    n_parameters: int = 0
-
-    def __post_init__(self) -> None:
-        rows, cols = self.shape
-        self.n_segments = self.n_edges + 1
-        self.scratch = Scratch.empty()
-        self.edges = Edges(
-            segments=np.empty((self.n_segments, 4)),
-            limb=np.empty(self.n_segments, np.int8),
-            head=np.empty((rows + 2, cols + 2), np.int32),
-            link=np.empty(self.n_links, np.int32),
-            owner=np.empty(self.n_links, np.int32),
-            heights=np.empty(CLUSTER),
-            ends=np.empty((self.n_segments, 2), np.int32),
-            extent=np.empty((2, 4)),
-            line=np.empty(4),
-        )
-        self.samples = _room_for(self.n_samples)
-        self.borders = _room_for_borders(self.n_borders, self.n_parameters)
-
-    def make_room(self, reached: int) -> None:
-        """Grow what was too short, as :func:`plan_rays` says in place of the next view."""
-        if reached == SHORT_LINKS:
-            self.grow_links()
-        elif reached == SHORT_SEGMENTS:
-            self.grow_segments()
-        else:
-            self.grow_samples()
-
-    def grow_segments(self) -> None:
-        n = self.n_segments = 2 * self.n_segments + _LINKS
-        self.edges = self.edges._replace(
-            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
-        )
-
-    def grow_links(self) -> None:
-        n = 2 * len(self.edges.link)
-        self.edges = self.edges._replace(link=np.empty(n, np.int32), owner=np.empty(n, np.int32))
-
-    def grow_samples(self) -> None:
-        self.samples = _room_for(2 * len(self.samples.weights))
-        self.borders = _room_for_borders(2 * len(self.borders.weights), self.n_parameters)
-
-
-def _room_for(n: int) -> Samples:
-    return Samples(
-        points=np.empty((n, 2)),
-        rays=np.empty((n, 2)),
-        weights=np.empty(n),
-        regions=np.empty(n, np.int32),
-        pixel=np.empty(n, np.int64),
-        face=np.empty(n, np.int32),
-        chosen=np.empty(n, np.int64),
-        origins=np.empty((n, 3), np.float32),
-        directions=np.empty((n, 3), np.float32),
-        returns=Returns.empty(_RETURNS),
-    )
-
-
-def _room_for_borders(n: int, p: int) -> Borders:
-    return Borders(
-        placed=np.zeros(1, np.int64),
-        points=np.empty((n, 2)),
-        weights=np.empty(n),
-        regions=np.empty((n, 2), np.int32),
-        segment=np.empty(n, np.int32),
-        ends=np.empty((n, 2), np.int32),
-        along=np.empty((n, 2)),
-        side=np.empty(n),
-        along_v=np.empty(n, np.int8),
-        pixel=np.empty(n, np.int64),
-        depth=np.empty(n),
-        rates=np.empty((n, p)),
-    )
+_PARTS = 2
+"""Parts of a landmark: lower and upper."""
 
 
 class Renderer:
@@ -204,10 +104,15 @@ class Renderer:
             raise UsageError(f"'harmonics' must be whole orders of 2 or more, got {tuple(harmonics)!r}")
         self.sensor = sensor
         self.albedo = float(albedo)
-        self.splits = int(splits)
-        self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
-        self._harmonics = tuple(int(order) for order in harmonics)
-        self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
+        self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
+        self._integral = AreaIntegral(
+            self.topology,
+            make_intersector(self.topology.vertices, self.topology.faces, intersector),
+            sensor,
+            albedo=self.albedo,
+            harmonics=tuple(int(order) for order in harmonics),
+            splits=int(splits),
+        )
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
 
@@ -221,6 +126,8 @@ class Renderer:
         """
         other = copy.copy(self)
         other.sensor, other.untrusted_pixels = sensor, 0
+        other._integral = copy.copy(self._integral)
+        other._integral.sensor = sensor
         return other
 
     def render(
@@ -445,7 +352,7 @@ class Renderer:
         images = self._render(seen, behind, whole, workers, slope=by_pixel, parameters=parameters)
         slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
         slope = slope[:, :, 0] if m == 1 else slope
-        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.closed)
+        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.split)
         full = np.flatnonzero(unknown)
         if full.size:
             slope[full] = self._differences(seen[full], behind[full], parameters, workers)
@@ -512,45 +419,28 @@ class Renderer:
         With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
         frequencies change with `parameters`.
         """
-        run = self._render_tasks if variant == "exact" else self._cast_centres
         order = self._by_direction(views) if slope is None else slice(None)
         ordered, behind = views[order], background[order]
+        slopes = None
         if slope is not None:
-            run = partial(self._render_tasks, slope=slope, parameters=parameters)
-        first, stop = rows
-        shape = (len(views), stop - first, self.sensor.cols)
-        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
-        sums = _no_light(shape, len(columns_hz))
-        camera = _camera(self.sensor, rows, points_a_side(background))
-        light = Light(
-            self.albedo,
-            1 / self.sensor.metres_per_radian,
-            np.array(columns_hz) / columns_hz[0],
-            self.sensor.vignetting,
-            _fastest(self.sensor),
-        )
-        views_per_task = 64
-        tasks = [slice(i, min(i + views_per_task, len(views))) for i in range(0, len(views), views_per_task)]
-        lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
-        mapped(lambda lane: run(lane, ordered, behind, camera, light, sums), lanes, workers)
+            turns = np.array([name in _TURNING for name in parameters], np.bool_) & bool(background[:, :2].any())
+            slopes = Slopes(slope, partial(_motion, ordered, parameters), turns)
+        poses = _poses(ordered, behind, self.sensor.cam2level)
+        sums = self._integral.sums(poses, n_parts=_PARTS, rows=rows, workers=workers, variant=variant, slopes=slopes)
         untrusted = int((sums.state == UNTRUSTED).sum())
         with _COUNTING:
             self.untrusted_pixels += untrusted
-        phasor, intensity, coverage, upper = (
-            _restored(values.reshape(*shape, *values.shape[1:]), order)
-            for values in (sums.phasor, sums.intensity, sums.coverage, sums.upper)
-        )
-        return PhasorImages(
-            phasor=np.ascontiguousarray(phasor[..., 0]),
-            intensity=intensity,
-            coverage=np.minimum(coverage, 1.0),
-            upper_coverage=np.minimum(upper, 1.0),
-            sensor=self.sensor,
+        images = images_of_sums(sums, self._integral)
+        upper = np.minimum(sums.shares[:, 1].reshape(sums.state.shape), 1.0)
+        return replace(
+            images,
+            phasor=_restored(images.phasor, order),
+            intensity=_restored(images.intensity, order),
+            coverage=_restored(images.coverage, order),
+            upper_coverage=_restored(upper, order),
             views=views,
-            harmonics={order: np.ascontiguousarray(phasor[..., k]) for k, order in enumerate(self._harmonics, start=1)},
-            by_hz={
-                hz: np.ascontiguousarray(phasor[..., k]) for k, hz in enumerate(columns_hz) if k > len(self._harmonics)
-            },
+            harmonics={k: _restored(values, order) for k, values in images.harmonics.items()},
+            by_hz={hz: _restored(values, order) for hz, values in images.by_hz.items()},
         )
 
     def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
@@ -558,85 +448,6 @@ class Renderer:
         if len(self.topology.faces) < _LARGE:
             return slice(None)
         return np.argsort(views.delta_rad, kind="stable")
-
-    def _render_tasks(
-        self,
-        tasks: Iterable[slice],
-        views: Views,
-        background: NDArray[np.float64],
-        camera: Camera,
-        light: Light,
-        sums: Sums,
-        slope: NDArray[np.complex128] | None = None,
-        parameters: Sequence[str] = (),
-    ) -> None:
-        """Render slices of the views into `sums`, in one thread; with `slope`, (m, pixels, p), how they change too."""
-        mesh = self.topology
-        turns = np.array([name in _TURNING for name in parameters], np.bool_) & background[:, :2].any()
-        buffers = _Buffers(
-            len(mesh.creases) + len(mesh.folds),
-            (camera.rows, camera.cols),
-            n_borders=_BORDERS if parameters else 0,
-            n_parameters=len(parameters),
-        )
-        for task in tasks:
-            poses, own = _poses(views[task], background[task], camera), _of_views(sums, task)
-            behind = background[task, :2].any()
-            slopes = None
-            if slope is not None:
-                motion = _motion(views[task], poses, camera, parameters)
-                columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
-                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
-                slopes = SlopeSums(slope[:, _pixels_of(task, sums)], columns, motion, own, turns)
-            view = 0
-            while view < len(poses.lens):
-                reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges,
-                    buffers.scratch, buffers.samples, own.state, buffers.borders,
-                )  # fmt: skip
-                if reached <= view:
-                    buffers.make_room(reached)
-                    continue
-                self._find_faces(n, buffers.samples, own.state, poses, camera)
-                sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
-                if behind:
-                    add_background(view, reached, poses, camera, light, own)
-                if slopes is not None:
-                    slopes.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, light)
-                view = reached
-            if slopes is not None:
-                slopes.conclude()
-
-    def _cast_centres(
-        self, tasks: Iterable[slice], views: Views, background: NDArray[np.float64], camera: Camera, light: Light,
-        sums: Sums,
-    ) -> None:  # fmt: skip
-        """Render slices of the views with one ray a pixel into `sums`, in one thread."""
-        v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
-        centres = np.column_stack([u.ravel(), v.ravel()])
-        for task in tasks:
-            poses = _poses(views[task], background[task], camera)
-            n = len(poses.lens) * len(centres)
-            samples = _room_for(n)
-            samples.points[:] = np.tile(centres, (len(poses.lens), 1))
-            samples.weights[:] = 1.0
-            samples.pixel[:] = samples.chosen[:] = np.arange(n)
-            trace(0, n, samples, camera)
-            aim(n, samples, poses, camera)
-            samples.face[:] = self._intersector.first_face(samples.origins, samples.directions)
-            sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
-
-    def _find_faces(self, n: int, samples: Samples, state: NDArray[np.uint8], poses: Poses, camera: Camera) -> None:
-        """Find the face that each of n samples sees, −1 for none, into ``samples.face``."""
-
-        def cast(count: int) -> NDArray[np.int32]:
-            aim(count, samples, poses, camera)
-            return self._intersector.first_face(samples.origins[:count], samples.directions[:count])
-
-        mesh = self.topology
-        scouts = cast(pick_scouts(n, samples))
-        rest = share_faces(n, mesh, mesh.closed, scouts, samples, poses, camera, state)
-        samples.face[samples.chosen[:rest]] = cast(rest)
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens is inside the landmark's box and no farther from the axis than its vertices."""
@@ -656,15 +467,6 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {least_m:.3g} at this 'delta_rad'"
             )
-
-
-def _fastest(sensor: Sensor) -> float:
-    """Return the radians per metre of the highest modulation frequency, 0 of a single slow one behind an ideal lens."""
-    highest = max(sensor.frequencies_hz)
-    slow_hz = 10e6  # frequency up to which the phase of a floor turns so little within a pixel that none is cut
-    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= slow_hz:
-        return 0.0
-    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:
@@ -696,104 +498,25 @@ def background_image(background: Background, sensor: Sensor) -> PhasorImages:
 
 _COUNTING = Lock()
 """Threads may share a renderer, and its count; the lock is no part of it, so that it can be copied and pickled."""
-_TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 
-def _topology(mesh: SurfaceMesh) -> MeshTopology:
-    """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
-    arrays = (mesh.vertices, mesh.faces, mesh.face_attributes.get("part", ()))
-    digest = hashlib.blake2b()
-    for array in arrays:
-        values = np.ascontiguousarray(array)
-        digest.update(f"{values.dtype}{values.shape}".encode())
-        digest.update(values.tobytes())
-    key = digest.digest()
-    found = _TOPOLOGIES.get(key)
-    if found is None:
-        faces, n = np.asarray(mesh.faces), len(mesh.vertices)
-        wrong = faces[(faces < 0) | (faces >= n)]
-        if wrong.size:
-            raise UsageError(f"a face of the mesh names vertex {wrong[0]}, but there are {n}, counted from 0")
-        found = MeshTopology.from_mesh(unite_shells(mesh))
-        _TOPOLOGIES[key] = found
-        most_topologies = 16
-        if len(_TOPOLOGIES) > most_topologies:
-            _TOPOLOGIES.popitem(last=False)
-    return found
-
-
-def _camera(sensor: Sensor, rows: tuple[int, int], rules: tuple[int, ...]) -> Camera:
-    """Return a camera as the kernels take it, which rows to render, and how backgrounds are integrated over a pixel."""
-    tan_h, tan_v = sensor.tan_half_angles
-    scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
-    slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
-    if sensor.lens is not None and sensor.bends_rays:
-        scale, slope = (sensor.lens.fx, sensor.lens.fy), (1 / sensor.lens.fx, 1 / sensor.lens.fy)
-    return Camera(
-        scale_u=scale[0],
-        scale_v=scale[1],
-        centre_u=float(sensor.centre_px[0]),
-        centre_v=float(sensor.centre_px[1]),
-        slope_u=slope[0],
-        slope_v=slope[1],
-        rows=sensor.rows,
-        cols=sensor.cols,
-        first_row=rows[0],
-        stop_row=rows[1],
-        fill_u=float(sensor.fill_factor[0]),
-        fill_v=float(sensor.fill_factor[1]),
-        level=np.ascontiguousarray(sensor.cam2level),
-        distortion=distortion_of(sensor, rules),
-    )
-
-
-def _poses(views: Views, background: NDArray[np.float64], camera: Camera) -> Poses:
+def _poses(views: Views, background: NDArray[np.float64], level: NDArray[np.float64]) -> Poses:
     rotation, translation = views.landmark2cam()
     return Poses(
         views.lens_in_landmark(),
-        product(camera.level.T, rotation),
-        product(translation[:, None], camera.level)[:, 0],
+        product(level.T, rotation),
+        product(translation[:, None], level)[:, 0],
         views.bearing_rad,
-        product(views.tilt2level(), camera.level),
+        product(views.tilt2level(), level),
         np.ascontiguousarray(background),
     )
 
 
-def _motion(views: Views, poses: Poses, camera: Camera, parameters: Sequence[str]) -> Motion:
-    """Return the poses of views, and of each with one parameter after the other moved."""
-    p = len(parameters)
-    many = Views(*(np.repeat(getattr(views, name), 1 + p) for name in VIEW_FIELDS))
+def _motion(views: Views, parameters: Sequence[str], which: slice, poses: Poses, camera: Camera) -> Motion:
+    """Return the poses of some of the views, and of each with one parameter after the other moved."""
+    p, own = len(parameters), views[which]
+    many = Views(*(np.repeat(getattr(own, name), 1 + p) for name in VIEW_FIELDS))
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     background = np.repeat(poses.background, 1 + p, axis=0)
-    return Motion(_poses(many, background, camera), np.full(p, STEP), np.empty((1 + p, 4)))
-
-
-def _no_light(shape: tuple[int, int, int], n_orders: int) -> Sums:
-    """Return the sums that a batch of n views starts from; `shape` is (n, rows, cols)."""
-    n = math.prod(shape)
-    return Sums(
-        phasor=np.zeros((n, n_orders), np.complex128),
-        intensity=np.zeros(n),
-        coverage=np.zeros(n),
-        upper=np.zeros(n),
-        state=np.zeros(shape, np.uint8),
-    )
-
-
-def _pixels_of(views: slice, sums: Sums) -> slice:
-    """Return which pixels belong to some views."""
-    per_view = math.prod(sums.state.shape[1:])
-    return slice(views.start * per_view, views.stop * per_view)
-
-
-def _of_views(sums: Sums, views: slice) -> Sums:
-    """Return the part of the sums that belongs to some views."""
-    pixels = _pixels_of(views, sums)
-    return Sums(
-        phasor=sums.phasor[pixels],
-        intensity=sums.intensity[pixels],
-        coverage=sums.coverage[pixels],
-        upper=sums.upper[pixels],
-        state=sums.state[views],
-    )
+    return Motion(_poses(many, background, camera.level), np.full(p, STEP), np.empty((1 + p, 4)))

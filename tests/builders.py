@@ -194,4 +194,4 @@ ODD: dict[str, Callable[[], trimesh.Trimesh]] = {
 def cut_alike(monkeypatch: pytest.MonkeyPatch, sensor: Sensor) -> None:
     """Let every camera cut pixels as finely as the highest frequency of a camera makes it do."""
     fastest = max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
-    monkeypatch.setattr("phasemark.render.renderer._fastest", lambda _: fastest)
+    monkeypatch.setattr("phasemark.render.integral.area_integral._fastest", lambda _: fastest)

@@ -151,13 +151,13 @@ def test_bulges_and_patches_with_an_apex_are_searched_and_hollows_are_not():
 @pytest.mark.parametrize("name", sorted(catalog()))
 def test_hardly_any_ray_but_the_scouts_is_cast_on_a_bulge(name, monkeypatch):
     renderer = Renderer(build_mesh(catalog()[name]), preset("pmd-16x16"))
-    cast, counts = renderer._intersector.first_face, []
+    cast, counts = renderer._integral.intersector.first_face, []
 
     def counted(origins, directions):
         counts.append(len(origins))
         return cast(origins, directions)
 
-    monkeypatch.setattr(renderer._intersector, "first_face", counted)
+    monkeypatch.setattr(renderer._integral.intersector, "first_face", counted)
     renderer.render(np.linspace(0.75, 2.0, 40), np.linspace(0, 3, 40), 0.02, 0.03)
     scouts, others = sum(counts[::2]), sum(counts[1::2])
     # on the cone one in seven near the apex, where slivers are thinner than the search can step over

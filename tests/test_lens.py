@@ -73,11 +73,11 @@ def test_rays_are_those_that_opencv_projects_to_the_same_pixels(name):
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_the_kernels_trace_the_same_rays_back(name):
+    from phasemark.render.integral.area_integral import camera_of
     from phasemark.render.integral.image_rays import ray_of
-    from phasemark.render.renderer import _camera
 
     sensor = SENSORS[name]
-    kernels = _camera(sensor, (0, sensor.rows), ())
+    kernels = camera_of(sensor, (0, sensor.rows), ())
     rng = np.random.default_rng(4)
     for u, v in rng.uniform(0, [sensor.cols, sensor.rows], (200, 2)):
         np.testing.assert_allclose(ray_of(kernels, u, v), np.ravel(sensor.tangents(u, v)), atol=1e-12)

@@ -35,8 +35,8 @@ from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.landmarks import LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Revolution
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
+from phasemark.render.integral.area_integral import Variant
 from phasemark.render.planar import PlanarLandmark, planar_images
-from phasemark.render.renderer import Variant
 
 ImagesOf = Callable[[Views], PhasorImages]
 

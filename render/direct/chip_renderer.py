@@ -22,9 +22,10 @@ from phasemark.render.direct.bin_counts import detected_counts
 from phasemark.render.direct.expected_targets import expected_targets
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.view_signals import STEPS, ViewSignals, moved_about
+from phasemark.render.integral.area_integral import Variant
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
-from phasemark.render.renderer import Renderer, Variant
+from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Views
 

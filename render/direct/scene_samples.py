@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
+from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, topology_of
 from phasemark.render.integral.arguments import Camera, Poses, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import make_intersector
@@ -23,10 +24,9 @@ from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.quadrature_rules import G2W, G2X, gauss_legendre
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
 from phasemark.render.integral.surface_mesh import SurfaceMesh
-from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
 from phasemark.render.kernel import kernel
-from phasemark.render.renderer import _Buffers, _poses, _topology
-from phasemark.render.rigid import product, rigid_transforms
+from phasemark.render.renderer import _poses
+from phasemark.render.rigid import rigid_transforms
 from phasemark.render.view import Views
 
 LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
@@ -79,9 +79,9 @@ class SceneMesh:
     """
 
     def __init__(self, mesh: SurfaceMesh | None, *, intersector: str = "auto") -> None:
-        self.topology = MeshTopology.empty() if mesh is None else _topology(mesh)
+        self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
         self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
-        self._idle: defaultdict[tuple[int, int], list[_Buffers]] = defaultdict(list)
+        self._idle: defaultdict[tuple[int, int], list[Buffers]] = defaultdict(list)
         """Scratch that no thread is using, by the size of its grid."""
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
@@ -104,15 +104,7 @@ class SceneMesh:
             A transform is not finite or not rigid.
         """
         transforms = rigid_transforms(landmark2cam)
-        rotation, translation = transforms[:, :3, :3], transforms[:, :3, 3]
-        poses = Poses(
-            -product(translation[:, None], rotation)[:, 0],
-            product(grid.level.T, rotation),
-            product(translation[:, None], grid.level)[:, 0],
-            np.zeros(len(transforms)),
-            np.repeat(grid.level[None], len(transforms), axis=0),
-            parameters_of_views(None, len(transforms)),
-        )
+        poses = camera_poses(transforms, grid.level, parameters_of_views(None, len(transforms)))
         return self._of_poses(poses, grid, (1.0, 1.0))
 
     def samples_of_views(
@@ -144,7 +136,7 @@ class SceneMesh:
         SceneSamples
         """
         behind = parameters_of_views(background, len(views))
-        return self._of_poses(_poses(views, behind, grid), grid, (finest_m, farthest_m))
+        return self._of_poses(_poses(views, behind, grid.level), grid, (finest_m, farthest_m))
 
     def _of_poses(self, poses: Poses, grid: Camera, scale: tuple[float, float]) -> SceneSamples:
         found = [
@@ -165,7 +157,7 @@ class SceneMesh:
             buffers = idle.pop()
         except IndexError:  # every thread has scratch of its own
             n_edges = len(mesh.creases) + len(mesh.folds)
-            buffers = _Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
+            buffers = Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
         behind = bool(background[:2].any())
         # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
         radians_per_scale = 1.5
@@ -180,13 +172,7 @@ class SceneMesh:
             buffers.make_room(reached)
         samples = buffers.samples
 
-        def cast(count: int) -> NDArray[np.int32]:
-            aim(count, samples, pose, grid)
-            return np.asarray(self._intersector.first_face(samples.origins[:count], samples.directions[:count]))
-
-        scouts = cast(pick_scouts(n, samples))
-        rest = share_faces(n, mesh, mesh.closed, scouts, samples, pose, grid, state)
-        samples.face[samples.chosen[:rest]] = cast(rest)
+        find_faces(n, samples, state, mesh, self._intersector, pose, grid)
         more = _count_free(state[0], pose, grid, background, scale) if behind else 0
         columns = np.empty((n + more, 2)), np.empty(n + more), np.empty(n + more), np.empty(n + more, np.int8)
         kept = _hits(n, samples, mesh, pose, grid, background, columns)
@@ -263,6 +249,7 @@ def _hits(n, samples, mesh, poses, camera, background, columns):  # type: ignore
         y, z = samples.rays[k, 0], samples.rays[k, 1]
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
+            reflected *= mesh.albedo[face]
             seen = mesh.part[face]
         else:
             dx, dy, dz = towards_level(poses.level[0], y, z)

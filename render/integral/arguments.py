@@ -117,7 +117,7 @@ class Light(NamedTuple):
     Parameters
     ----------
     albedo : float
-        Of the landmark.
+        Of the surface, times that of the face.
     radians_per_metre : float
         4πf / c of the first frequency f.
     orders : (k,) float64
@@ -301,8 +301,9 @@ class Sums(NamedTuple):
     Parameters
     ----------
     phasor : (pixels, k) complex128
-    intensity, coverage, upper : (pixels,) float64
-        `upper` is the coverage by the landmark's upper part.
+    intensity, coverage : (pixels,) float64
+    shares : (pixels, parts) float64
+        The coverage by each part of the surface.
     state : (n, rows, cols) uint8
         Per pixel whether it was sampled, see :mod:`~phasemark.render.integral.ray_plan`.
     """
@@ -310,7 +311,7 @@ class Sums(NamedTuple):
     phasor: NDArray[np.complex128]
     intensity: NDArray[np.float64]
     coverage: NDArray[np.float64]
-    upper: NDArray[np.float64]
+    shares: NDArray[np.float64]
     state: NDArray[np.uint8]
 
 

@@ -50,8 +50,8 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     start_extents(edges)
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
-        # a closed mesh hides what turns its back, and a valley from everywhere but between its slopes
-        if mesh.closed:
+        # a closed shell hides what turns its back, and a valley from everywhere but between its slopes
+        if mesh.closed[face]:
             before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue

@@ -48,23 +48,22 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
     """Write the returns of some samples, and add them to intensity and coverage."""
     rays, weights, returns = samples.rays, samples.weights, samples.returns
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
-    index, view, intensity, coverage, upper = samples.pixel[start], 0, 0.0, 0.0, 0.0
+    index, view, intensity, coverage = samples.pixel[start], 0, 0.0, 0.0
     for k in range(start, stop):
         if k == start or samples.pixel[k] != index:
             if k > start:
-                sums.intensity[index], sums.coverage[index], sums.upper[index] = intensity, coverage, upper
+                sums.intensity[index], sums.coverage[index] = intensity, coverage
             index = samples.pixel[k]
             view = index // pixels_per_view
-            intensity, coverage, upper = sums.intensity[index], sums.coverage[index], sums.upper[index]
+            intensity, coverage = sums.intensity[index], sums.coverage[index]
         y, z = rays[k, 0], rays[k, 1]
         length = math.sqrt(1.0 + y * y + z * z)
         face = samples.face[k]
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
-            reflected *= light.albedo
+            reflected *= light.albedo * mesh.albedo[face]
             coverage += weights[k]
-            if mesh.part[face]:
-                upper += weights[k]
+            sums.shares[index, mesh.part[face]] += weights[k]
         elif poses.background[view, 0] > 0.0 or poses.background[view, 1] > 0.0:
             dx, dy, dz = towards_level(poses.level[view], y, z)
             cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
@@ -76,7 +75,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
         a = weights[k] * _amplitude(distance, reflected, length, light.vignetting) if t != 0.0 else 0.0
         intensity += a
         returns.amplitude[k - start], returns.phase[k - start] = a, light.radians_per_metre * distance
-    sums.intensity[index], sums.coverage[index], sums.upper[index] = intensity, coverage, upper
+    sums.intensity[index], sums.coverage[index] = intensity, coverage
 
 
 @kernel

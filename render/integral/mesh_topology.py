@@ -53,8 +53,13 @@ class MeshTopology(NamedTuple):
         beyond the edge from each corner to the next (3; −1: there is none); and the patch.
     grid : FaceGrid
         Where the faces of the searched patches are.
-    part : (f,) int8
-        0 for the landmark's lower part, 1 for the upper one.
+    part : (f,) int32
+        Part of the surface that a face belongs to: 0 for a landmark's lower part, 1 for the upper one; in a scene the
+        number of the body.
+    albedo : (f,) float64
+        Of each face, relative to that of the surface.
+    closed : (f,) bool
+        Whether the face belongs to a shell that is watertight and wound outward, so that its back is never seen.
     concave : (e,) bool
         Whether a crease is the bottom of a valley; then it is seen only from before both of its faces.
     creases : (e, 4) int32
@@ -75,8 +80,9 @@ class MeshTopology(NamedTuple):
         Corners of the box around all vertices.
     radius_m : float
         Distance of the farthest vertex from the origin.
-    closed : bool
-        Whether every shell of the mesh is watertight and wound outward, so that what faces away is never seen.
+    split : bool
+        Whether the face that is seen changes at creases and silhouettes only: surfaces pass through one another
+        nowhere but along creases.
     """
 
     vertices: NDArray[np.float64]
@@ -89,7 +95,9 @@ class MeshTopology(NamedTuple):
     searched: NDArray[np.bool_]
     search: NDArray[np.float32]
     grid: FaceGrid
-    part: NDArray[np.int8]
+    part: NDArray[np.int32]
+    albedo: NDArray[np.float64]
+    closed: NDArray[np.bool_]
     creases: NDArray[np.int32]
     concave: NDArray[np.bool_]
     folds: NDArray[np.int32]
@@ -99,7 +107,7 @@ class MeshTopology(NamedTuple):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     radius_m: float
-    closed: bool
+    split: bool
 
     @classmethod
     def from_mesh(cls, mesh: SurfaceMesh) -> MeshTopology:
@@ -115,7 +123,7 @@ class MeshTopology(NamedTuple):
             raise UsageError("the mesh has a vertex that is not finite")
         vertices, merged = np.unique(raw + 0.0, axis=0, return_inverse=True)
         faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
-        part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int8)
+        part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -152,6 +160,7 @@ class MeshTopology(NamedTuple):
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
         )
+        closed = bool(regular.all() and (six_volumes > 0).all())
         return cls(
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
@@ -166,6 +175,8 @@ class MeshTopology(NamedTuple):
             ),
             grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
+            albedo=np.ones(len(faces)),
+            closed=np.full(len(faces), closed),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(rise[crease] > 0),
             folds=folds,
@@ -175,7 +186,7 @@ class MeshTopology(NamedTuple):
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
             radius_m=float(np.linalg.norm(vertices, axis=1).max()),
-            closed=bool(regular.all() and (six_volumes > 0).all()),
+            split=closed,
         )
 
     @classmethod
@@ -192,7 +203,9 @@ class MeshTopology(NamedTuple):
             searched=np.zeros(0, np.bool_),
             search=np.zeros((0, 16), np.float32),
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
-            part=np.zeros(0, np.int8),
+            part=np.zeros(0, np.int32),
+            albedo=np.zeros(0),
+            closed=np.zeros(0, np.bool_),
             creases=np.zeros((0, 4), np.int32),
             concave=np.zeros(0, np.bool_),
             folds=np.zeros((0, 3), np.int32),
@@ -202,7 +215,7 @@ class MeshTopology(NamedTuple):
             low=np.zeros(3),
             high=np.zeros(3),
             radius_m=0.0,
-            closed=True,
+            split=True,
         )
 
 
@@ -226,9 +239,9 @@ def _in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
     return lines
 
 
-def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int8]:
+def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int32]:
     """Label the parts of an unlabelled mesh by the side of the interface plane on which each face's centre lies."""
-    return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int8)
+    return np.asarray(vertices[faces].mean(axis=1)[:, 2] > 0, dtype=np.int32)
 
 
 def _angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

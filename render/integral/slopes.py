@@ -55,7 +55,7 @@ class SlopeSums:
             phasor=np.empty((pixels, len(columns)), np.complex128),
             intensity=np.empty(pixels),
             coverage=np.empty(pixels),
-            upper=np.empty(pixels),
+            shares=np.empty((pixels, own.shares.shape[1])),
             state=own.state,
         )
         self._moved = np.zeros((p, pixels, len(columns)), np.complex128)

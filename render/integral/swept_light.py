@@ -75,7 +75,7 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
             g, t = find_face(mesh.search, mesh.grid, face, lens[0], lens[1], lens[2], dx, dy, dz)
             face = g if g >= 0 else face
         t, cos_theta = landmark_hit(mesh, face, lens, matrix, y, z)
-        return t, phasor_of(t * length, light.albedo * cos_theta, length, light)
+        return t, phasor_of(t * length, light.albedo * mesh.albedo[face] * cos_theta, length, light)
     # where wall and floor meet, the point itself is on both: which of them this side sees, its sample tells
     cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
     own_y, own_z = samples.rays[nearest, 0], samples.rays[nearest, 1]

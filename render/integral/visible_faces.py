@@ -46,12 +46,12 @@ def _scout(start, stop, weights):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
+def share_faces(n, mesh, scout_face, samples, poses, camera, state):  # type: ignore[no-untyped-def]
     """Assign the face of a scout ray to its interval where it sees no other, and list the samples left to cast.
 
     On a plain patch the plane is the same for all samples, and where the scout met nothing nothing is met. On a
     searched patch each sample's face is looked for from the scout's, and on any other curved patch it is cast.
-    Pixels that could not be split are cast throughout, as is everything without `share`.
+    Pixels that could not be split are cast throughout, as is a surface without ``split``.
 
     Returns how many indices were written to ``samples.chosen``.
     """
@@ -62,7 +62,7 @@ def share_faces(n, mesh, share, scout_face, samples, poses, camera, state):  # t
         if k < n and regions[k] == regions[start]:
             continue
         scout, found = _scout(start, k, samples.weights), scout_face[region]
-        known = share and states[pixel[start]] == SPLIT
+        known = mesh.split and states[pixel[start]] == SPLIT
         face[scout] = found
         if known and (found < 0 or mesh.plain[found]):
             for i in range(start, k):

@@ -1,0 +1,454 @@
+"""Area integral of a surface: what the pixels of a camera receive from it, many poses at once (PHYSICS section 3)."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
+from phasemark.render.integral.image_rays import trace
+from phasemark.render.integral.intersect import Intersector
+from phasemark.render.integral.lens_tables import distortion_of
+from phasemark.render.integral.light import add_background, points_a_side, sum_samples
+from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
+from phasemark.render.integral.pixel_splitting import Scratch
+from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, plan_rays
+from phasemark.render.integral.shells import unite_shells
+from phasemark.render.integral.slopes import SlopeSums
+from phasemark.render.integral.surface_mesh import SurfaceMesh
+from phasemark.render.integral.visible_faces import aim, pick_scouts, share_faces
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.rigid import product
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
+from phasemark.render.view import Views
+
+Variant = Literal["exact", "hard"]
+"""The area integral, or what the centre ray of each pixel sees."""
+
+_SAMPLES = 1 << 17
+_RETURNS = 1 << 9
+_BORDERS = 1 << 14
+_LINKS = 1 << 10
+"""Further segments that a view is given room for when edges become chains behind a lens with distortion."""
+
+
+@dataclass
+class Buffers:
+    """Scratch of one thread; grows when a view needs more."""
+
+    n_edges: int
+    shape: tuple[int, int]
+    n_samples: int = _SAMPLES
+    n_links: int = 1 << 14
+    n_borders: int = 0
+    n_parameters: int = 0
+
+    def __post_init__(self) -> None:
+        rows, cols = self.shape
+        self.n_segments = self.n_edges + 1
+        self.scratch = Scratch.empty()
+        self.edges = Edges(
+            segments=np.empty((self.n_segments, 4)),
+            limb=np.empty(self.n_segments, np.int8),
+            head=np.empty((rows + 2, cols + 2), np.int32),
+            link=np.empty(self.n_links, np.int32),
+            owner=np.empty(self.n_links, np.int32),
+            heights=np.empty(CLUSTER),
+            ends=np.empty((self.n_segments, 2), np.int32),
+            extent=np.empty((2, 4)),
+            line=np.empty(4),
+        )
+        self.samples = _room_for(self.n_samples)
+        self.borders = _room_for_borders(self.n_borders, self.n_parameters)
+
+    def make_room(self, reached: int) -> None:
+        """Grow what was too short, as :func:`plan_rays` says in place of the next view."""
+        if reached == SHORT_LINKS:
+            self._grow_links()
+        elif reached == SHORT_SEGMENTS:
+            self._grow_segments()
+        else:
+            self._grow_samples()
+
+    def _grow_segments(self) -> None:
+        n = self.n_segments = 2 * self.n_segments + _LINKS
+        self.edges = self.edges._replace(
+            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
+        )
+
+    def _grow_links(self) -> None:
+        n = 2 * len(self.edges.link)
+        self.edges = self.edges._replace(link=np.empty(n, np.int32), owner=np.empty(n, np.int32))
+
+    def _grow_samples(self) -> None:
+        self.samples = _room_for(2 * len(self.samples.weights))
+        self.borders = _room_for_borders(2 * len(self.borders.weights), self.n_parameters)
+
+
+def _room_for(n: int) -> Samples:
+    return Samples(
+        points=np.empty((n, 2)),
+        rays=np.empty((n, 2)),
+        weights=np.empty(n),
+        regions=np.empty(n, np.int32),
+        pixel=np.empty(n, np.int64),
+        face=np.empty(n, np.int32),
+        chosen=np.empty(n, np.int64),
+        origins=np.empty((n, 3), np.float32),
+        directions=np.empty((n, 3), np.float32),
+        returns=Returns.empty(_RETURNS),
+    )
+
+
+def _room_for_borders(n: int, p: int) -> Borders:
+    return Borders(
+        placed=np.zeros(1, np.int64),
+        points=np.empty((n, 2)),
+        weights=np.empty(n),
+        regions=np.empty((n, 2), np.int32),
+        segment=np.empty(n, np.int32),
+        ends=np.empty((n, 2), np.int32),
+        along=np.empty((n, 2)),
+        side=np.empty(n),
+        along_v=np.empty(n, np.int8),
+        pixel=np.empty(n, np.int64),
+        depth=np.empty(n),
+        rates=np.empty((n, p)),
+    )
+
+
+@dataclass(frozen=True)
+class Slopes:
+    """How the phasors change with the parameters of a view, to be filled beside the sums.
+
+    Parameters
+    ----------
+    by_pixel : (m, pixels of all poses, p) complex128
+        At each of the sensor's m frequencies, added to.
+    motion : callable
+        From a slice of the poses and the camera to their motion.
+    turns : (p,) bool
+        Parameters that turn what stands behind the surface.
+    """
+
+    by_pixel: NDArray[np.complex128]
+    motion: Callable[[slice, Poses, Camera], Motion]
+    turns: NDArray[np.bool_]
+
+
+class AreaIntegral:
+    """Integrates what a camera sees of a surface over the active area of each pixel.
+
+    Parameters
+    ----------
+    topology : MeshTopology
+        The surface.
+    intersector : Intersector
+        Of the same vertices and faces.
+    sensor : Sensor
+        The camera.
+    albedo : float
+        Multiplied with that of each face.
+    harmonics : tuple of int
+        Harmonic orders k > 1 wanted beside the signal.
+    splits : int
+        Boxes a side that every pixel is cut into before anything else.
+    """
+
+    def __init__(
+        self,
+        topology: MeshTopology,
+        intersector: Intersector,
+        sensor: Sensor,
+        *,
+        albedo: float = 1.0,
+        harmonics: tuple[int, ...] = (),
+        splits: int = 1,
+    ) -> None:
+        self.topology = topology
+        self.intersector = intersector
+        self.sensor = sensor
+        self.albedo = albedo
+        self.harmonics = harmonics
+        self.splits = splits
+
+    @property
+    def columns_hz(self) -> list[float]:
+        """Frequencies of the phasors in the order of the sums: each modulation frequency and its harmonics."""
+        return phasor_frequencies_hz(self.sensor.frequencies_hz, self.harmonics)
+
+    def sums(
+        self,
+        poses: Poses,
+        *,
+        n_parts: int,
+        rows: tuple[int, int] | None = None,
+        workers: int = 1,
+        variant: Variant = "exact",
+        slopes: Slopes | None = None,
+    ) -> Sums:
+        """Return the sums of all pixels.
+
+        Parameters
+        ----------
+        poses : Poses
+            n poses.
+        n_parts : int
+            Number of parts of the surface.
+        rows : (first, stop), optional
+            Image rows; None: all.
+        workers : int
+            Threads; the result does not depend on their number.
+        variant : {"exact", "hard"}
+        slopes : Slopes, optional
+            Filled too.
+
+        Returns
+        -------
+        Sums
+            Pixels in the order (pose, row, column).
+        """
+        rows = (0, self.sensor.rows) if rows is None else rows
+        n, columns_hz = len(poses.lens), self.columns_hz
+        sums = _no_light((n, rows[1] - rows[0], self.sensor.cols), len(columns_hz), n_parts)
+        camera = camera_of(self.sensor, rows, points_a_side(poses.background))
+        light = Light(
+            self.albedo,
+            1 / self.sensor.metres_per_radian,
+            np.array(columns_hz) / columns_hz[0],
+            self.sensor.vignetting,
+            _fastest(self.sensor),
+        )
+        poses_per_task = 64
+        tasks = [slice(i, min(i + poses_per_task, n)) for i in range(0, n, poses_per_task)]
+        lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
+
+        def run(lane: Iterable[slice]) -> None:
+            if variant == "exact":
+                self._integrate(lane, poses, camera, light, sums, slopes)
+            else:
+                self._cast_centres(lane, poses, camera, light, sums)
+
+        mapped(run, lanes, workers)
+        return sums
+
+    def _integrate(
+        self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums, slopes: Slopes | None
+    ) -> None:
+        """Integrate slices of the poses into `sums`, and `slopes` if they are asked for, in one thread."""
+        mesh = self.topology
+        buffers = Buffers(
+            len(mesh.creases) + len(mesh.folds),
+            (camera.rows, camera.cols),
+            n_borders=0 if slopes is None else _BORDERS,
+            n_parameters=0 if slopes is None else len(slopes.turns),
+        )
+        for task in tasks:
+            poses, own = _of_poses(every, task), _of_views(sums, task)
+            behind = poses.background[:, :2].any()
+            slope_sums = None
+            if slopes is not None:
+                columns_hz = self.columns_hz
+                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
+                by_pixel = slopes.by_pixel[:, _pixels_of(task, sums)]
+                slope_sums = SlopeSums(by_pixel, columns, slopes.motion(task, poses, camera), own, slopes.turns)
+            view = 0
+            while view < len(poses.lens):
+                reached, n = plan_rays(
+                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges,
+                    buffers.scratch, buffers.samples, own.state, buffers.borders,
+                )  # fmt: skip
+                if reached <= view:
+                    buffers.make_room(reached)
+                    continue
+                find_faces(n, buffers.samples, own.state, mesh, self.intersector, poses, camera)
+                sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
+                if behind:
+                    add_background(view, reached, poses, camera, light, own)
+                if slope_sums is not None:
+                    slope_sums.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, light)
+                view = reached
+            if slope_sums is not None:
+                slope_sums.conclude()
+
+    def _cast_centres(self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums) -> None:
+        """Sum slices of the poses with one ray a pixel into `sums`, in one thread."""
+        v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
+        centres = np.column_stack([u.ravel(), v.ravel()])
+        for task in tasks:
+            poses = _of_poses(every, task)
+            n = len(poses.lens) * len(centres)
+            samples = _room_for(n)
+            samples.points[:] = np.tile(centres, (len(poses.lens), 1))
+            samples.weights[:] = 1.0
+            samples.pixel[:] = samples.chosen[:] = np.arange(n)
+            trace(0, n, samples, camera)
+            aim(n, samples, poses, camera)
+            samples.face[:] = self.intersector.first_face(samples.origins, samples.directions)
+            sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
+
+
+def find_faces(
+    n: int,
+    samples: Samples,
+    state: NDArray[np.uint8],
+    mesh: MeshTopology,
+    intersector: Intersector,
+    poses: Poses,
+    camera: Camera,
+) -> None:
+    """Find the face that each of n samples sees, −1 for none, into ``samples.face``."""
+
+    def cast(count: int) -> NDArray[np.int32]:
+        aim(count, samples, poses, camera)
+        return intersector.first_face(samples.origins[:count], samples.directions[:count])
+
+    scouts = cast(pick_scouts(n, samples))
+    rest = share_faces(n, mesh, scouts, samples, poses, camera, state)
+    samples.face[samples.chosen[:rest]] = cast(rest)
+
+
+def _fastest(sensor: Sensor) -> float:
+    """Return the radians per metre of the highest modulation frequency, 0 of a single slow one behind an ideal lens."""
+    highest = max(sensor.frequencies_hz)
+    slow_hz = 10e6  # frequency up to which the phase of a floor turns so little within a pixel that none is cut
+    if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= slow_hz:
+        return 0.0
+    return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
+
+
+_TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
+
+
+def topology_of(mesh: SurfaceMesh) -> MeshTopology:
+    """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
+    arrays = (mesh.vertices, mesh.faces, mesh.face_attributes.get("part", ()))
+    digest = hashlib.blake2b()
+    for array in arrays:
+        values = np.ascontiguousarray(array)
+        digest.update(f"{values.dtype}{values.shape}".encode())
+        digest.update(values.tobytes())
+    key = digest.digest()
+    found = _TOPOLOGIES.get(key)
+    if found is None:
+        faces, n = np.asarray(mesh.faces), len(mesh.vertices)
+        wrong = faces[(faces < 0) | (faces >= n)]
+        if wrong.size:
+            raise UsageError(f"a face of the mesh names vertex {wrong[0]}, but there are {n}, counted from 0")
+        found = MeshTopology.from_mesh(unite_shells(mesh))
+        _TOPOLOGIES[key] = found
+        most_topologies = 16
+        if len(_TOPOLOGIES) > most_topologies:
+            _TOPOLOGIES.popitem(last=False)
+    return found
+
+
+def camera_of(sensor: Sensor, rows: tuple[int, int], rules: tuple[int, ...]) -> Camera:
+    """Return a camera as the kernels take it, which rows to render, and how backgrounds are integrated over a pixel."""
+    tan_h, tan_v = sensor.tan_half_angles
+    scale = sensor.cols / (2 * tan_h), sensor.rows / (2 * tan_v)
+    slope = 2 * tan_h / sensor.cols, 2 * tan_v / sensor.rows
+    if sensor.lens is not None and sensor.bends_rays:
+        scale, slope = (sensor.lens.fx, sensor.lens.fy), (1 / sensor.lens.fx, 1 / sensor.lens.fy)
+    return Camera(
+        scale_u=scale[0],
+        scale_v=scale[1],
+        centre_u=float(sensor.centre_px[0]),
+        centre_v=float(sensor.centre_px[1]),
+        slope_u=slope[0],
+        slope_v=slope[1],
+        rows=sensor.rows,
+        cols=sensor.cols,
+        first_row=rows[0],
+        stop_row=rows[1],
+        fill_u=float(sensor.fill_factor[0]),
+        fill_v=float(sensor.fill_factor[1]),
+        level=np.ascontiguousarray(sensor.cam2level),
+        distortion=distortion_of(sensor, rules),
+    )
+
+
+def _no_light(shape: tuple[int, int, int], n_orders: int, n_parts: int) -> Sums:
+    """Return the sums that a batch of n views starts from; `shape` is (n, rows, cols)."""
+    n = math.prod(shape)
+    return Sums(
+        phasor=np.zeros((n, n_orders), np.complex128),
+        intensity=np.zeros(n),
+        coverage=np.zeros(n),
+        shares=np.zeros((n, n_parts)),
+        state=np.zeros(shape, np.uint8),
+    )
+
+
+def _of_poses(poses: Poses, which: slice) -> Poses:
+    """Return some of the poses."""
+    return Poses(*(np.ascontiguousarray(column[which]) for column in poses))
+
+
+def _pixels_of(views: slice, sums: Sums) -> slice:
+    """Return which pixels belong to some views."""
+    per_view = math.prod(sums.state.shape[1:])
+    return slice(views.start * per_view, views.stop * per_view)
+
+
+def _of_views(sums: Sums, views: slice) -> Sums:
+    """Return the part of the sums that belongs to some views."""
+    pixels = _pixels_of(views, sums)
+    return Sums(
+        phasor=sums.phasor[pixels],
+        intensity=sums.intensity[pixels],
+        coverage=sums.coverage[pixels],
+        shares=sums.shares[pixels],
+        state=sums.state[views],
+    )
+
+
+def camera_poses(
+    surface2cam: NDArray[np.float64], level: NDArray[np.float64], background: NDArray[np.float64]
+) -> Poses:
+    """Return the poses of a surface from rigid transforms.
+
+    Parameters
+    ----------
+    surface2cam : (n, 4, 4) float64
+        From the surface's frame to that of the camera's mount (x along the axis, y left, z up).
+    level : (3, 3) float64
+        Camera frame to that of its mount.
+    background : (n, 4) float64
+        What stands behind, in the mount's frame.
+    """
+    rotation, translation = surface2cam[:, :3, :3], surface2cam[:, :3, 3]
+    n = len(surface2cam)
+    return Poses(
+        -product(translation[:, None], rotation)[:, 0],
+        product(level.T, rotation),
+        product(translation[:, None], level)[:, 0],
+        np.zeros(n),
+        np.repeat(level[None], n, axis=0),
+        background,
+    )
+
+
+def images_of_sums(sums: Sums, integral: AreaIntegral) -> PhasorImages:
+    """Return the sums of all pixels as images, (n, rows, cols)."""
+    shape, first = sums.state.shape, 1 + len(integral.harmonics)
+    columns = [np.ascontiguousarray(sums.phasor[:, k]).reshape(shape) for k in range(sums.phasor.shape[1])]
+    return PhasorImages(
+        phasor=columns[0],
+        intensity=sums.intensity.reshape(shape),
+        coverage=np.minimum(sums.coverage, 1.0).reshape(shape),
+        sensor=integral.sensor,
+        views=Views.broadcast(np.empty(0)),
+        harmonics=dict(zip(integral.harmonics, columns[1:first], strict=True)),
+        by_hz=dict(zip(integral.columns_hz[first:], columns[first:], strict=True)),
+    )
