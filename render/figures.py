@@ -255,8 +255,13 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     draw_map(
         right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
     )
-    figure.suptitle(f"view {index}: {view_in_words(images.views, index)}")
+    figure.suptitle(image_in_words(images.views, index))
     return figure
+
+
+def image_in_words(views: Views | None, index: int) -> str:
+    """Return the number of an image, and its view where it shows one."""
+    return f"image {index}" if views is None else f"view {index}: {view_in_words(views, index)}"
 
 
 def view_in_words(views: Views, index: int) -> str:

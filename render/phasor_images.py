@@ -107,8 +107,8 @@ class PhasorImages:
         Share of the active area that sees the landmark, 0 … 1.
     sensor : Sensor
         The camera.
-    views : Views
-        Views of the landmark.
+    views : Views, or None
+        Views of the landmark; None for images of anything else.
     upper_coverage : (n, rows, cols) float64, or None
         Share of the active area that sees the landmark's upper part; the rest of `coverage` sees the lower one. None
         where parts are not distinguished.
@@ -125,14 +125,14 @@ class PhasorImages:
     intensity: NDArray[np.float64]
     coverage: NDArray[np.float64]
     sensor: Sensor
-    views: Views
+    views: Views | None = None
     upper_coverage: NDArray[np.float64] | None = None
     harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
     by_hz: Mapping[float, NDArray[np.complex128]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """Describe in one line how many images there are, and the camera."""
-        return f"PhasorImages({len(self)} views, {self.sensor!r})"
+        return f"PhasorImages({len(self)} {'images' if self.views is None else 'views'}, {self.sensor!r})"
 
     def __len__(self) -> int:
         return len(self.phasor)

@@ -112,6 +112,7 @@ def test_images_and_frames_can_be_drawn_for_a_first_look():
     assert "view 0: D = 1.000 m, δ = 30.00°, b = 0.00°, h = 0.000 m" in texts(figure)
     with pytest.raises(UsageError, match="there is no view 1: they count from 0 to 0"):
         images.plot(1)
+    assert "image 0" in texts(PhasorImages(phasor[None], amplitude[None], amplitude[None], SENSOR).plot())
 
     flags = np.where(np.isnan(ranges), int(Flag.NO_RETURN), 0)
     flags[0, 0] = int(Flag.MISSING | Flag.SATURATED)

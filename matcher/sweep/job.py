@@ -219,7 +219,7 @@ class SweepJob:
             if what not in bounds and self.is_stranger(number):
                 bounds[what] = np.full((len(views), p, p), np.nan)
             elif what not in bounds:
-                bounds[what] = self.bound(number, method, image)
+                bounds[what] = self.bound(number, method, views)
             begun = time.perf_counter()
             matches = self._match(number, m, frames[kind], first)
             out["seconds"][:, m] = (time.perf_counter() - begun) / len(views)
@@ -315,26 +315,27 @@ class SweepJob:
         condition = self.all_conditions[number]
         if true.histogram is not None:  # what the chip makes of its counts
             frames = capture_ranges(
-                self._mesh(number, condition.dimension_error), true, image.views, albedo=condition.albedo,
-                background=self.background(number), rng=rng, n_frames=condition.n_frames, first_view=first,
+                self._mesh(number, condition.dimension_error), true, self.views(number, first, first + len(image)),
+                albedo=condition.albedo, background=self.background(number), rng=rng, n_frames=condition.n_frames,
+                first_view=first,
             )  # fmt: skip
         else:
             frames = capture(image, true, rng=rng, n_frames=condition.n_frames, first_view=first)
         return frames if true == believed else frames.taken_by(believed)
 
-    def bound(self, number: int, method: Method, image: PhasorImages) -> NDArray[np.float64]:
-        """Return the Cramér–Rao bound of the true world at the views of an image of it.
+    def bound(self, number: int, method: Method, views: Views) -> NDArray[np.float64]:
+        """Return the Cramér–Rao bound of the true world at some views.
 
         (n, p, p), NaN for what is not estimated.
         """
         free = method.parameters
         found = cramer_rao(
-            self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), image.views,
+            self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), views,
             free=free, n_frames=self.all_conditions[number].n_frames,
             on="phasors" if method.on == "phasors" else "ranges", pixels=method.pixels,
             background=self.background(number),
         )  # fmt: skip
-        return _spread(found.covariance, free, len(image), self.plan.n_numbers)
+        return _spread(found.covariance, free, len(views), self.plan.n_numbers)
 
     def confusion(self, number: int, views: Views, first: int) -> NDArray[np.float64]:
         """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.

@@ -13,7 +13,7 @@ from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.targets import Status
-from phasemark.render.figures import check_index, draw_range, view_in_words, whole_ticks
+from phasemark.render.figures import check_index, draw_range, image_in_words, whole_ticks
 from phasemark.render.sensor.sensor import Sensor
 
 if TYPE_CHECKING:
@@ -57,8 +57,7 @@ def expected_figure(images: HistogramImages, index: int = 0) -> Figure:
     matplotlib.figure.Figure
     """
     check_index("view", index, len(images))
-    title = f"view {index}: {view_in_words(images.views, index)}"
-    return _figure(images.expected[index], images.sensor, "expected counts", title)
+    return _figure(images.expected[index], images.sensor, "expected counts", image_in_words(images.views, index))
 
 
 def _figure(counts: NDArray[np.float64], sensor: Sensor, what: str, title: str) -> Figure:

@@ -43,8 +43,8 @@ class HistogramImages:
         Counts of the landmark and what stands behind it, all bins together, without pile-up.
     sensor : Sensor
         The camera.
-    views : Views
-        Views of the landmark.
+    views : Views, or None
+        Views of the landmark; None for histograms of anything else.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -53,7 +53,7 @@ class HistogramImages:
     expected: NDArray[np.float64]
     signal: NDArray[np.float64]
     sensor: Sensor
-    views: Views
+    views: Views | None = None
 
     def __len__(self) -> int:
         return len(self.expected)
