@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
     from phasemark.render.bench.data_sheet.characterise import characterise
     from phasemark.render.direct.capture import capture
+    from phasemark.render.scene.body import Body
+    from phasemark.render.scene.scene import Scene
+    from phasemark.render.scene.scene_renderer import SceneRenderer
     from phasemark.render.sensor.camera_unit import camera_unit
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)  # what takes time to import, and few need
@@ -28,10 +31,13 @@ else:
 
 __all__ = [
     "Background",
+    "Body",
     "Flag",
     "Frames",
     "PhasorImages",
     "Renderer",
+    "Scene",
+    "SceneRenderer",
     "Sensor",
     "Views",
     "background_image",

@@ -116,6 +116,10 @@ class PhasorImages:
         S_k for the orders k > 1 that were asked for, of the first modulation frequency.
     by_hz : mapping of float to (n, rows, cols) complex128
         S at further frequencies, in hertz: the sensor's other modulation frequencies and the harmonics of each.
+    shares : (n, rows, cols, b) float64, or None
+        Share of the active area that each of b bodies of a scene fills.
+    bodies : tuple of str
+        Their names.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -129,6 +133,8 @@ class PhasorImages:
     upper_coverage: NDArray[np.float64] | None = None
     harmonics: Mapping[int, NDArray[np.complex128]] = field(default_factory=dict)
     by_hz: Mapping[float, NDArray[np.complex128]] = field(default_factory=dict)
+    shares: NDArray[np.float64] | None = None
+    bodies: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Describe in one line how many images there are, and the camera."""

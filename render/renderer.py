@@ -430,7 +430,7 @@ class Renderer:
         untrusted = int((sums.state == UNTRUSTED).sum())
         with _COUNTING:
             self.untrusted_pixels += untrusted
-        images = images_of_sums(sums, self._integral)
+        images = images_of_sums(sums, self.sensor, self._integral.harmonics)
         upper = np.minimum(sums.shares[:, 1].reshape(sums.state.shape), 1.0)
         return replace(
             images,

@@ -233,7 +233,7 @@ class CalibrationModel:
     @property
     def reach_m(self) -> float:
         """Distance of the landmark's farthest point from its origin."""
-        return self._renderer.topology.radius_m
+        return float(np.linalg.norm(self._renderer.topology.vertices, axis=1).max())
 
     def check_behind(self, theta: NDArray[np.float64], slack_m: float) -> None:
         """Refuse walls and floors that cut the landmark by more than a mounting may be off.

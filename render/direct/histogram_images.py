@@ -45,6 +45,10 @@ class HistogramImages:
         The camera.
     views : Views, or None
         Views of the landmark; None for histograms of anything else.
+    shares : (n, rows, cols, b) float64, or None
+        Share of each zone that each of b bodies of a scene fills.
+    bodies : tuple of str
+        Their names.
     """
 
     figure: ClassVar[Callable[..., Figure]]
@@ -54,6 +58,8 @@ class HistogramImages:
     signal: NDArray[np.float64]
     sensor: Sensor
     views: Views | None = None
+    shares: NDArray[np.float64] | None = None
+    bodies: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.expected)
@@ -195,7 +201,7 @@ class HistogramRenderer:
                 seen[task], self.grid, background=background, finest_m=0.5 * histogram.bin_width_m,
                 farthest_m=self.axis.nodes_m[-1],
             )  # fmt: skip
-            samples = samples._replace(part=(samples.part >= WALL).astype(np.int8))
+            samples = samples._replace(part=(samples.part >= WALL).astype(np.int32))
             light = zone_transients(samples, self.sensor, self.axis)
             for part in range(1 if background is None else 2):
                 out[task, part] = counts_of_light(light[:, part], self.sensor, self.axis)

@@ -23,7 +23,7 @@ from phasemark.render.direct.footprints import (
     histogram_of,
 )
 from phasemark.render.direct.scene_samples import FLOOR, SceneSamples
-from phasemark.render.direct.transients import PARTS
+from phasemark.render.direct.transients import PARTS, through_lens
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 
@@ -108,7 +108,9 @@ def _signals(
     response = optics.response
     # zones of one response are lit alike by stray light, which is then added to their counts in the end
     alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
-    _add_samples(samples, albedos, place, optics, sensor.cols, 0.0 if alike else histogram.stray, out)
+    _add_samples(
+        through_lens(samples, sensor), albedos, place, optics, sensor.cols, 0.0 if alike else histogram.stray, out
+    )
     if alike and histogram.stray > 0:
         out += histogram.stray * out.mean(axis=2, keepdims=True)
     out *= histogram.cycles * histogram.photons

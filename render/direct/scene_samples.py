@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, topology_of
+from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, of_poses, topology_of
 from phasemark.render.integral.arguments import Camera, Poses, towards_level
 from phasemark.render.integral.image_rays import ray_of
-from phasemark.render.integral.intersect import make_intersector
+from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.quadrature_rules import G2W, G2X, gauss_legendre
@@ -32,7 +32,6 @@ from phasemark.render.view import Views
 LOWER, UPPER, WALL, FLOOR = 0, 1, 2, 3
 """Parts of a scene: the landmark's lower and upper part, and the planes behind it."""
 
-_BEFORE_WALL = WALL - 1  # planes are numbered from 1
 _SAMPLES = 1 << 15
 _MOST_BOXES = 32
 
@@ -48,17 +47,21 @@ class SceneSamples(NamedTuple):
     range_m : (m,) float64
         Path length along the ray.
     amplitude : (m,) float64
-        cos θ / r² for albedo 1, times the area of tangents that the point stands for; of the background times its
-        albedo.
-    part : (m,) int8
-        `LOWER` or `UPPER` part of the mesh, or `WALL` or `FLOOR` behind it.
+        cos θ / r² times the area of tangents that the point stands for, times the albedo of faces that have one of
+        their own and of the background.
+    area : (m,) float64
+        Area of tangents that the point stands for.
+    part : (m,) int32
+        `LOWER` or `UPPER` part of the mesh, or `WALL` or `FLOOR` behind it; in a scene the body, and the numbers after
+        the last body for wall and floor.
     """
 
     start: NDArray[np.int64]
     tangents: NDArray[np.float64]
     range_m: NDArray[np.float64]
     amplitude: NDArray[np.float64]
-    part: NDArray[np.int8]
+    area: NDArray[np.float64]
+    part: NDArray[np.int32]
 
     @property
     def n_views(self) -> int:
@@ -79,8 +82,20 @@ class SceneMesh:
     """
 
     def __init__(self, mesh: SurfaceMesh | None, *, intersector: str = "auto") -> None:
-        self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
-        self._intersector = make_intersector(self.topology.vertices, self.topology.faces, intersector)
+        topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
+        self._use(topology, make_intersector(topology.vertices, topology.faces, intersector), WALL)
+
+    @classmethod
+    def of_surface(cls, topology: MeshTopology, intersector: Intersector, n_parts: int) -> SceneMesh:
+        """Take samples of a surface that has been analysed, of so many parts."""
+        surface = cls.__new__(cls)
+        surface._use(topology, intersector, n_parts)
+        return surface
+
+    def _use(self, topology: MeshTopology, intersector: Intersector, n_parts: int) -> None:
+        self.topology = topology
+        self._intersector = intersector
+        self._n_parts = n_parts
         self._idle: defaultdict[tuple[int, int], list[Buffers]] = defaultdict(list)
         """Scratch that no thread is using, by the size of its grid."""
 
@@ -105,7 +120,7 @@ class SceneMesh:
         """
         transforms = rigid_transforms(landmark2cam)
         poses = camera_poses(transforms, grid.level, parameters_of_views(None, len(transforms)))
-        return self._of_poses(poses, grid, (1.0, 1.0))
+        return self.samples_of_poses(poses, grid, 1.0, 1.0)
 
     def samples_of_views(
         self,
@@ -136,16 +151,15 @@ class SceneMesh:
         SceneSamples
         """
         behind = parameters_of_views(background, len(views))
-        return self._of_poses(_poses(views, behind, grid.level), grid, (finest_m, farthest_m))
+        return self.samples_of_poses(_poses(views, behind, grid.level), grid, finest_m, farthest_m)
 
-    def _of_poses(self, poses: Poses, grid: Camera, scale: tuple[float, float]) -> SceneSamples:
-        found = [
-            self._of_pose(Poses(*(np.ascontiguousarray(column[k : k + 1]) for column in poses)), grid, scale)
-            for k in range(len(poses.lens))
-        ]
-        counts = [len(range_m) for _, range_m, _, _ in found]
+    def samples_of_poses(self, poses: Poses, grid: Camera, finest_m: float, farthest_m: float) -> SceneSamples:
+        """Sample what a grid of cells sees from poses; see :meth:`samples_of_views`."""
+        scale = finest_m, farthest_m
+        found = [self._of_pose(of_poses(poses, slice(k, k + 1)), grid, scale) for k in range(len(poses.lens))]
+        counts = [len(columns[0]) for columns in found]
         start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-        columns = [np.concatenate([columns[k] for columns in found]) for k in range(4)]
+        columns = [np.concatenate(column) for column in zip(*found, strict=True)]
         return SceneSamples(start, *columns)
 
     def _of_pose(self, pose: Poses, grid: Camera, scale: tuple[float, float]) -> tuple[NDArray[np.float64], ...]:
@@ -174,11 +188,12 @@ class SceneMesh:
 
         find_faces(n, samples, state, mesh, self._intersector, pose, grid)
         more = _count_free(state[0], pose, grid, background, scale) if behind else 0
-        columns = np.empty((n + more, 2)), np.empty(n + more), np.empty(n + more), np.empty(n + more, np.int8)
-        kept = _hits(n, samples, mesh, pose, grid, background, columns)
+        numbers = (np.empty(n + more) for _ in range(3))
+        columns = np.empty((n + more, 2)), *numbers, np.empty(n + more, np.int32)
+        kept = _hits(n, samples, mesh, pose, grid, background, self._n_parts, columns)
         idle.append(buffers)
         if more:
-            kept = _fill_free(kept, state[0], pose, grid, background, scale, columns)
+            kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
         return tuple(column[:kept] for column in columns)
 
 
@@ -219,7 +234,8 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
         np.tile(points, (n, 1)),
         range_m.ravel(),
         (cosine * area / range_m**2).ravel(),
-        np.zeros(n * len(points), np.int8),
+        np.tile(area, n),
+        np.zeros(n * len(points), np.int32),
     )
 
 
@@ -227,16 +243,17 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
 def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[no-untyped-def]
     """Write a point of the ray (1, y, z) in line k of the columns of :class:`SceneSamples`; returns the next line."""
     length = math.sqrt(1.0 + y * y + z * z)
-    tangents, range_m, amplitude, parts = columns
+    tangents, range_m, amplitude, areas, parts = columns
     tangents[k, 0], tangents[k, 1] = y, z
     range_m[k] = t * length
     amplitude[k] = reflected / length / (t * length * t * length) * weight * area
+    areas[k] = weight * area
     parts[k] = part
     return k + 1
 
 
 @kernel
-def _hits(n, samples, mesh, poses, camera, background, columns):  # type: ignore[no-untyped-def]
+def _hits(n, samples, mesh, poses, camera, background, n_parts, columns):  # type: ignore[no-untyped-def]
     """Fill path length and amplitude of the samples that meet something; returns how many there are."""
     kept = 0
     area = 1.0 / (camera.scale_u * camera.scale_v)
@@ -254,7 +271,8 @@ def _hits(n, samples, mesh, poses, camera, background, columns):  # type: ignore
         else:
             dx, dy, dz = towards_level(poses.level[0], y, z)
             t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
-            reflected, seen = rho * facing, _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
+            reflected = rho * facing
+            seen = n_parts - 1 + nearer_plane(background, cos_b, sin_b, dx, dy, dz)  # planes are numbered from 1
         if t > 0.0:
             kept = _keep(columns, kept, y, z, t, reflected, samples.weights[k], area, seen)
     return kept
@@ -296,7 +314,7 @@ def _count_free(state, poses, camera, background, scale):  # type: ignore[no-unt
 
 
 @kernel
-def _fill_free(kept, state, poses, camera, background, scale, columns):  # type: ignore[no-untyped-def]
+def _fill_free(kept, state, poses, camera, background, scale, n_parts, columns):  # type: ignore[no-untyped-def]
     """Append the background's points in cells that the landmark does not touch; returns how many points there are.
 
     Two Gauss points a side of a box.
@@ -316,6 +334,6 @@ def _fill_free(kept, state, poses, camera, background, scale, columns):  # type:
                     t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
                     if t > 0.0:
                         weight = G2W[i % 2] * G2W[j % 2] / (n_u * n_v) * area
-                        part = _BEFORE_WALL + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
+                        part = n_parts - 1 + nearer_plane(background, cos_b, sin_b, dx, dy, dz)
                         kept = _keep(columns, kept, y, z, t, rho * facing, weight, 1.0, part)
     return kept

@@ -83,10 +83,16 @@ def zone_transients(
     """
     zones = footprints_of(sensor) if footprints is None else footprints
     out = np.zeros((samples.n_views, PARTS, len(zones.centre), axis.n))
-    if sensor.vignetting:
-        samples = samples._replace(amplitude=samples.amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2)
+    samples = through_lens(samples, sensor)
     _add_samples(samples, zones, 1 / footprint_areas(zones), axis, out)
     return out
+
+
+def through_lens(samples: SceneSamples, sensor: Sensor) -> SceneSamples:
+    """Return samples with the amplitude that passes the lens: less by cos⁴ off the axis where it vignettes."""
+    if not sensor.vignetting:
+        return samples
+    return samples._replace(amplitude=samples.amplitude / (1 + (samples.tangents**2).sum(axis=1)) ** 2)
 
 
 @kernel
@@ -114,3 +120,33 @@ def _add_samples(samples, zones, scale, axis, out):  # type: ignore[no-untyped-d
                 row[i] += w * b
                 row[i + 1] += w * c
                 row[i + 2] += w * d
+
+
+def zone_shares(samples: SceneSamples, sensor: Sensor, n_parts: int) -> NDArray[np.float64]:
+    """Return the share of each zone's footprint that each part fills, (n, zones, n_parts); light plays no part.
+
+    Parameters
+    ----------
+    samples : SceneSamples
+        n poses.
+    sensor : Sensor
+    n_parts : int
+        Parts of the mesh or bodies of the scene; what stands behind is left out.
+    """
+    zones = footprints_of(sensor)
+    zones = zones._replace(light=np.zeros(3))
+    out = np.zeros((samples.n_views, len(zones.centre), n_parts))
+    _add_shares(samples, zones, 1 / footprint_areas(zones), out)
+    return np.minimum(out, 1.0)
+
+
+@kernel
+def _add_shares(samples, zones, scale, out):  # type: ignore[no-untyped-def]
+    """Add the area of every sample to the zones that see it."""
+    for view in range(len(samples.start) - 1):
+        for k in range(samples.start[view], samples.start[view + 1]):
+            if samples.part[k] >= out.shape[2]:
+                continue
+            for q in range(out.shape[1]):
+                w = footprint_weight(zones, q, samples.tangents[k, 0], samples.tangents[k, 1])
+                out[view, q, samples.part[k]] += w * samples.area[k] * scale[q]

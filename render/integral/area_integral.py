@@ -30,7 +30,6 @@ from phasemark.render.rigid import product
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.threads import mapped
-from phasemark.render.view import Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -220,7 +219,7 @@ class AreaIntegral:
         """
         rows = (0, self.sensor.rows) if rows is None else rows
         n, columns_hz = len(poses.lens), self.columns_hz
-        sums = _no_light((n, rows[1] - rows[0], self.sensor.cols), len(columns_hz), n_parts)
+        sums = no_light((n, rows[1] - rows[0], self.sensor.cols), len(columns_hz), n_parts)
         camera = camera_of(self.sensor, rows, points_a_side(poses.background))
         light = Light(
             self.albedo,
@@ -254,7 +253,7 @@ class AreaIntegral:
             n_parameters=0 if slopes is None else len(slopes.turns),
         )
         for task in tasks:
-            poses, own = _of_poses(every, task), _of_views(sums, task)
+            poses, own = of_poses(every, task), _of_views(sums, task)
             behind = poses.background[:, :2].any()
             slope_sums = None
             if slopes is not None:
@@ -286,7 +285,7 @@ class AreaIntegral:
         v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
         centres = np.column_stack([u.ravel(), v.ravel()])
         for task in tasks:
-            poses = _of_poses(every, task)
+            poses = of_poses(every, task)
             n = len(poses.lens) * len(centres)
             samples = _room_for(n)
             samples.points[:] = np.tile(centres, (len(poses.lens), 1))
@@ -330,15 +329,20 @@ def _fastest(sensor: Sensor) -> float:
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 
-def topology_of(mesh: SurfaceMesh) -> MeshTopology:
-    """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
-    arrays = (mesh.vertices, mesh.faces, mesh.face_attributes.get("part", ()))
+def mesh_digest(mesh: SurfaceMesh) -> bytes:
+    """Return a digest of all that a renderer asks of a mesh."""
+    attributes = (mesh.face_attributes.get(name, ()) for name in ("part", "albedo"))
     digest = hashlib.blake2b()
-    for array in arrays:
+    for array in (mesh.vertices, mesh.faces, *attributes):
         values = np.ascontiguousarray(array)
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(values.tobytes())
-    key = digest.digest()
+    return digest.digest()
+
+
+def topology_of(mesh: SurfaceMesh) -> MeshTopology:
+    """Analyse a mesh, or return the analysis of the same mesh from a few calls ago."""
+    key = mesh_digest(mesh)
     found = _TOPOLOGIES.get(key)
     if found is None:
         faces, n = np.asarray(mesh.faces), len(mesh.vertices)
@@ -378,7 +382,7 @@ def camera_of(sensor: Sensor, rows: tuple[int, int], rules: tuple[int, ...]) -> 
     )
 
 
-def _no_light(shape: tuple[int, int, int], n_orders: int, n_parts: int) -> Sums:
+def no_light(shape: tuple[int, int, int], n_orders: int, n_parts: int) -> Sums:
     """Return the sums that a batch of n views starts from; `shape` is (n, rows, cols)."""
     n = math.prod(shape)
     return Sums(
@@ -390,7 +394,7 @@ def _no_light(shape: tuple[int, int, int], n_orders: int, n_parts: int) -> Sums:
     )
 
 
-def _of_poses(poses: Poses, which: slice) -> Poses:
+def of_poses(poses: Poses, which: slice) -> Poses:
     """Return some of the poses."""
     return Poses(*(np.ascontiguousarray(column[which]) for column in poses))
 
@@ -439,16 +443,16 @@ def camera_poses(
     )
 
 
-def images_of_sums(sums: Sums, integral: AreaIntegral) -> PhasorImages:
+def images_of_sums(sums: Sums, sensor: Sensor, harmonics: tuple[int, ...]) -> PhasorImages:
     """Return the sums of all pixels as images, (n, rows, cols)."""
-    shape, first = sums.state.shape, 1 + len(integral.harmonics)
+    shape, first = sums.state.shape, 1 + len(harmonics)
+    columns_hz = phasor_frequencies_hz(sensor.frequencies_hz, harmonics)
     columns = [np.ascontiguousarray(sums.phasor[:, k]).reshape(shape) for k in range(sums.phasor.shape[1])]
     return PhasorImages(
         phasor=columns[0],
         intensity=sums.intensity.reshape(shape),
         coverage=np.minimum(sums.coverage, 1.0).reshape(shape),
-        sensor=integral.sensor,
-        views=Views.broadcast(np.empty(0)),
-        harmonics=dict(zip(integral.harmonics, columns[1:first], strict=True)),
-        by_hz=dict(zip(integral.columns_hz[first:], columns[first:], strict=True)),
+        sensor=sensor,
+        harmonics=dict(zip(harmonics, columns[1:first], strict=True)),
+        by_hz=dict(zip(columns_hz[first:], columns[first:], strict=True)),
     )

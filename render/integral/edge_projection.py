@@ -16,7 +16,6 @@ import math
 import numpy as np
 
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
-from phasemark.render.integral.mesh_topology import CLUSTER
 from phasemark.render.kernel import kernel
 
 
@@ -60,13 +59,13 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             return FULL
     heights = edges.heights
     for c in range(len(clusters)):
-        px, py, pz, nx, ny, nz, d, turn, slack, reach, radius = clusters[c]
+        px, py, pz, nx, ny, nz, d, turn, slack, reach, radius, begin, size = clusters[c]
         dx, dy, dz = lens[0] - px, lens[1] - py, lens[2] - pz
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
         farthest = away + radius
         if abs(nx * dx + ny * dy + nz * dz - d) > turn * away + slack + reach * farthest:
             continue
-        first, count = c * CLUSTER, min(CLUSTER, smooth_planes.shape[1] - c * CLUSTER)
+        first, count = int(begin), int(size)
         for i in range(count):  # in vector instructions
             heights[i] = _smooth_height(smooth_planes, first + i, lens)
         for i in range(count):

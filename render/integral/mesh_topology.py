@@ -73,13 +73,12 @@ class MeshTopology(NamedTuple):
     smooth_planes : (5, g) float64
         Columns: planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over
         the face's folds at most. Each :data:`CLUSTER` are a cluster.
-    clusters : (c, 11) float64
+    clusters : (c, 13) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
-        differ from those at most, the largest reach, and how far the faces' corners are from the point at most.
+        differ from those at most, the largest reach, how far the faces' corners are from the point at most, and where
+        among the smooth faces it begins and how many it has.
     low, high : (3,) float64
         Corners of the box around all vertices.
-    radius_m : float
-        Distance of the farthest vertex from the origin.
     split : bool
         Whether the face that is seen changes at creases and silhouettes only: surfaces pass through one another
         nowhere but along creases.
@@ -106,12 +105,17 @@ class MeshTopology(NamedTuple):
     clusters: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
-    radius_m: float
     split: bool
 
     @classmethod
-    def from_mesh(cls, mesh: SurfaceMesh) -> MeshTopology:
+    def from_mesh(cls, mesh: SurfaceMesh, crease_rad: float = CREASE_RAD) -> MeshTopology:
         """Analyse a mesh; faces without area are dropped, vertices at one point merged.
+
+        Parameters
+        ----------
+        mesh : SurfaceMesh
+        crease_rad : float
+            Faces that meet at more than this are not joined smoothly.
 
         Raises
         ------
@@ -124,6 +128,7 @@ class MeshTopology(NamedTuple):
         vertices, merged = np.unique(raw + 0.0, axis=0, return_inverse=True)
         faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
+        albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -133,17 +138,17 @@ class MeshTopology(NamedTuple):
             raise UsageError("the mesh has no face with an area")
         kept = np.flatnonzero(kept)
         kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
-        faces, part, a = faces[kept], part[kept], a[kept]
+        faces, part, albedo, a = faces[kept], part[kept], albedo[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
         edges, regular = _edges(faces)
         first, other = edges[:, 2], edges[:, 3]
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
-        crease = ~regular | (turn > CREASE_RAD + 1e-9)
+        crease = ~regular | (turn > crease_rad + 1e-9) | (albedo[first] != albedo[other])
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
-        corners = _corner_normals(vertices, faces, normals, patch)
+        corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
@@ -165,17 +170,17 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_normals=_in_lines(corners.reshape(-1, 9)),
+            corner_normals=in_lines(corners.reshape(-1, 9)),
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
             searched=searched,
-            search=_in_lines(
+            search=in_lines(
                 np.column_stack([planes, shares.reshape(-1, 8), _neighbours(faces, edges[~crease]), patch])
             ),
             grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
-            albedo=np.ones(len(faces)),
+            albedo=np.ascontiguousarray(albedo),
             closed=np.full(len(faces), closed),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(rise[crease] > 0),
@@ -185,7 +190,6 @@ class MeshTopology(NamedTuple):
             clusters=clusters,
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
-            radius_m=float(np.linalg.norm(vertices, axis=1).max()),
             split=closed,
         )
 
@@ -211,10 +215,9 @@ class MeshTopology(NamedTuple):
             folds=np.zeros((0, 3), np.int32),
             first_fold=np.zeros(1, np.int32),
             smooth_planes=np.zeros((5, 0)),
-            clusters=np.zeros((0, 11)),
+            clusters=np.zeros((0, 13)),
             low=np.zeros(3),
             high=np.zeros(3),
-            radius_m=0.0,
             split=True,
         )
 
@@ -230,7 +233,7 @@ def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
     return np.argsort(key, kind="stable")
 
 
-def _in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
+def in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
     """Return rows of up to 16 numbers as float32, each in one line of the cache."""
     room = np.empty(64 * len(rows) + 64, np.uint8)
     begin = -room.ctypes.data % 64
@@ -310,7 +313,7 @@ def _cluster_faces(
     """Return the faces with folds, and bounds of each cluster's planes; see :class:`MeshTopology`."""
     smooth = np.flatnonzero(fold_reach >= 0)
     if not len(smooth):
-        return np.zeros(0, np.int32), np.zeros((0, 11))
+        return np.zeros(0, np.int32), np.zeros((0, 13))
     starts = np.arange(0, len(smooth), CLUSTER)
     size = np.diff(np.append(starts, len(smooth)))
     point = np.add.reduceat(corners[smooth].mean(axis=1), starts) / size[:, None]
@@ -325,7 +328,9 @@ def _cluster_faces(
         np.maximum.reduceat(values, starts)
         for values in (turn, np.abs(offset - mean_offset[own]), fold_reach[smooth], radius)
     ]
-    return smooth.astype(np.int32), np.ascontiguousarray(np.column_stack([point, normal, mean_offset, *bounds]))
+    return smooth.astype(np.int32), np.ascontiguousarray(
+        np.column_stack([point, normal, mean_offset, *bounds, starts, size])
+    )
 
 
 def _corner_shares(corners: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -350,8 +355,9 @@ def _corner_normals(
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],
     patch: NDArray[np.int32],
+    crease_rad: float,
 ) -> NDArray[np.float64]:
-    """Average, at each corner, the normals of the vertex's faces that lie within 30° of the corner's own face.
+    """Average, at each corner, the normals of the vertex's faces that lie within `crease_rad` of the corner's own face.
 
     Weighted by sin α / (|a| |b|), a and b being the edges of the face at the vertex and α the angle between them
     (N. Max, Weights for computing vertex normals from facet normals, 1999): exact where the vertex and its neighbours
@@ -361,7 +367,7 @@ def _corner_normals(
     """
     corner_of = np.argsort(faces.ravel(), kind="stable")
     start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
-    return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(CREASE_RAD + 1e-9)))
+    return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(crease_rad + 1e-9)))
 
 
 @njit(cache=True)

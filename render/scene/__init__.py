@@ -1,0 +1,1 @@
+"""Scenes: several bodies, their materials, and a camera anywhere (PHYSICS section 13)."""

@@ -1,0 +1,306 @@
+"""Bodies put together: one surface for the area integral, of which only what moved is rebuilt.
+
+Each body is analysed once, in its own frame. Where it stands, its arrays are turned and written into those of the
+scene. Curves along which bodies pass through one another are edges too.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.integral.area_integral import mesh_digest
+from phasemark.render.integral.face_search import FaceGrid
+from phasemark.render.integral.intersect import Intersector, make_intersector
+from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, in_lines
+from phasemark.render.integral.shells import unite_shells
+from phasemark.render.rigid import product
+from phasemark.render.scene.body import Body, Surface
+from phasemark.render.scene.crossings import crossings
+
+_NO_GRID = FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_))
+_WATCHED = np.array([[1.0, 0.31, 0.17], [-0.23, 1.0, 0.41], [0.37, -0.19, 1.0]])
+"""Directions, and their opposites, in which it is asked whether a lens is inside a body."""
+
+
+class Assembly:
+    """Bodies where they stand, as one surface.
+
+    Parameters
+    ----------
+    bodies : sequence of Body
+        In the order of the parts of the surface.
+    intersector : {"auto", "embree", "float64"}
+        As for :class:`~phasemark.render.Renderer`.
+    """
+
+    topology: MeshTopology
+    """All bodies, world frame."""
+    intersector: Intersector
+    """Of the topology's faces."""
+
+    def __init__(self, bodies: Sequence[Body], intersector: str) -> None:
+        self._kind = intersector
+        self._own = _analysed(bodies)
+        self._poses = np.array([body.pose for body in bodies])
+        self._moving = np.zeros(len(bodies), np.bool_)
+        self._still: tuple[NDArray[np.int64], Intersector] | None = None
+        self._curves: dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        self._first = _Firsts.of(self._own)
+        self._bounds = np.empty((len(bodies), 2, 3))
+        self._base = self._joined()
+        self._turn(np.arange(len(bodies)))
+
+    def copy(self) -> Assembly:
+        """Return one that can be placed otherwise; what stands still in both is shared."""
+        other = copy.copy(self)
+        other._moving, other._curves = self._moving.copy(), dict(self._curves)
+        other._poses, other._bounds = self._poses.copy(), self._bounds.copy()
+        base = self._base
+        other._base = base._replace(
+            vertices=base.vertices.copy(),
+            planes=base.planes.copy(),
+            corner_normals=in_lines(base.corner_normals),
+            search=in_lines(base.search),
+            smooth_planes=base.smooth_planes.copy(),
+            clusters=base.clusters.copy(),
+        )
+        return other
+
+    def place(self, body2world: NDArray[np.float64]) -> None:
+        """Move the bodies to (b, 4, 4) poses; what stands already where it is to stand is left as it is."""
+        moved = np.flatnonzero((body2world != self._poses).any(axis=(1, 2)))
+        if not moved.size:
+            return
+        if not self._moving[moved].all():
+            self._moving[moved] = True
+            self._still = None
+        self._poses = body2world.copy()
+        self._turn(moved)
+
+    def check_outside(self, lens_m: NDArray[np.float64], names: Sequence[str], frames: NDArray[np.int64]) -> None:
+        """Refuse a lens inside a closed body.
+
+        Parameters
+        ----------
+        lens_m : (n, 3) float64
+            World frame.
+        names : sequence of str
+            Of the bodies.
+        frames : (n,) int64
+            Their numbers, for the message.
+
+        Raises
+        ------
+        UsageError
+        """
+        directions = np.concatenate([_WATCHED, -_WATCHED])
+        rays = np.tile(directions, (len(lens_m), 1))
+        face = self.intersector.first_face(
+            np.repeat(lens_m, len(directions), axis=0).astype(np.float32), rays.astype(np.float32)
+        )
+        from_behind = np.einsum("ij,ij->i", self.topology.planes[face, :3], rays) > 0
+        inside = np.flatnonzero((face >= 0) & self.topology.closed[face] & from_behind)
+        if inside.size:
+            k = int(inside[0])
+            raise UsageError(
+                f"in frame {frames[k // len(directions)]} the lens is inside body"
+                f" '{names[self.topology.part[face[k]]]}': move one of them, leave the body out, or, if it is a room,"
+                " turn its faces inward"
+            )
+
+    def _joined(self) -> MeshTopology:
+        """Return what does not depend on poses, with room for what does."""
+        own, first = self._own, self._first
+        faces = [mesh.faces + first.vertex[b] for b, mesh in enumerate(own)]
+        creases = [_shifted(mesh.creases, first.vertex[b], first.face[b]) for b, mesh in enumerate(own)]
+        n_faces, n_smooth = first.face[-1], first.smooth[-1]
+        folds = [mesh.folds + np.array([first.vertex[b]] * 2 + [first.smooth[b]]) for b, mesh in enumerate(own)]
+        begins = [mesh.first_fold[:-1] + first.fold[b] for b, mesh in enumerate(own)]
+        patches = np.cumsum([0, *(int(mesh.patch.max()) + 1 for mesh in own)])
+        alone = len(own) == 1 and np.array_equal(self._poses[0], np.eye(4))
+        return MeshTopology(
+            vertices=np.empty((first.vertex[-1], 3)),
+            faces=np.ascontiguousarray(np.concatenate(faces), np.int32),
+            planes=np.empty((n_faces, 4)),
+            corner_normals=in_lines(np.zeros((n_faces, 9))),
+            flat=np.concatenate([mesh.flat for mesh in own]),
+            plain=np.concatenate([mesh.plain for mesh in own]),
+            patch=np.concatenate([mesh.patch + patches[b] for b, mesh in enumerate(own)]).astype(np.int32),
+            # the grid of a search does not turn with its faces
+            searched=own[0].searched if alone else np.zeros(n_faces, np.bool_),
+            search=in_lines(np.concatenate([mesh.search for mesh in own])),
+            grid=own[0].grid if alone else _NO_GRID,
+            part=np.repeat(np.arange(len(own)), np.diff(first.face)).astype(np.int32),
+            albedo=np.concatenate([mesh.albedo for mesh in own]),
+            closed=np.concatenate([mesh.closed for mesh in own]),
+            creases=np.ascontiguousarray(np.concatenate(creases), np.int32),
+            concave=np.concatenate([mesh.concave for mesh in own]),
+            folds=np.ascontiguousarray(np.concatenate(folds), np.int32),
+            first_fold=np.append(np.concatenate(begins), first.fold[-1]).astype(np.int32),
+            smooth_planes=np.empty((5, n_smooth)),
+            clusters=np.concatenate([mesh.clusters for mesh in own]),
+            low=np.zeros(3),
+            high=np.zeros(3),
+            split=True,
+        )
+
+    def _turn(self, moved: NDArray[np.int64]) -> None:
+        """Write the arrays of bodies that moved, and find where they cross others."""
+        mesh, first = self._base, self._first
+        for b in moved:
+            own, transposed, offset = self._own[b], self._poses[b, :3, :3].T, self._poses[b, :3, 3]
+            vertex, face = slice(*first.vertex[b : b + 2]), slice(*first.face[b : b + 2])
+            smooth, cluster = slice(*first.smooth[b : b + 2]), slice(*first.cluster[b : b + 2])
+            mesh.vertices[vertex] = product(own.vertices, transposed) + offset
+            mesh.planes[face] = _turned_planes(own.planes, transposed, offset, 1.0)
+            mesh.corner_normals[face, :9] = product(own.corner_normals[:, :9].reshape(-1, 3), transposed).reshape(-1, 9)
+            mesh.search[face, :4] = mesh.planes[face]
+            shares = own.search[:, 4:12].astype(np.float64).reshape(-1, 4)
+            mesh.search[face, 4:12] = _turned_planes(shares, transposed, offset, -1.0).reshape(-1, 8)
+            mesh.smooth_planes[:4, smooth] = _turned_planes(own.smooth_planes[:4].T, transposed, offset, 1.0).T
+            mesh.smooth_planes[4, smooth] = own.smooth_planes[4]
+            mesh.clusters[cluster, :3] = product(own.clusters[:, :3], transposed) + offset
+            mesh.clusters[cluster, 3:6] = product(own.clusters[:, 3:6], transposed)
+            corners = mesh.vertices[vertex]
+            self._bounds[b] = corners.min(axis=0), corners.max(axis=0)
+        self._cross(moved)
+        self.topology = self._with_curves()
+        self.intersector = self._intersectors()
+
+    def _cross(self, moved: NDArray[np.int64]) -> None:
+        """Find the curves along which bodies that moved pass through any other."""
+        gone = set(moved.tolist())
+        self._curves = {pair: found for pair, found in self._curves.items() if gone.isdisjoint(pair)}
+        corners = self._base.vertices[self._base.faces]
+        done = np.zeros(len(self._own), np.bool_)
+        for b in moved:
+            meets = ((self._bounds[b, 0] < self._bounds[:, 1]) & (self._bounds[:, 0] < self._bounds[b, 1])).all(axis=1)
+            done[b] = True
+            for other in np.flatnonzero(meets & ~done):
+                begin, beyond = self._first.face[b], self._first.face[other]
+                ends, pairs = crossings(
+                    corners[begin : self._first.face[b + 1]], corners[beyond : self._first.face[other + 1]]
+                )
+                if len(ends):
+                    self._curves[int(b), int(other)] = ends, pairs + np.array([begin, beyond])
+
+    def _with_curves(self) -> MeshTopology:
+        """Return the surface with the curves among its creases."""
+        base = self._base._replace(low=self._bounds[:, 0].min(axis=0), high=self._bounds[:, 1].max(axis=0))
+        if not self._curves:
+            return base
+        ends = np.concatenate([ends for ends, _ in self._curves.values()])
+        pairs = np.concatenate([pairs for _, pairs in self._curves.values()])
+        # what a closed body hides is asked of the first face: an open one hides nothing
+        open_last = base.closed[pairs[:, 0]] & ~base.closed[pairs[:, 1]]
+        pairs[open_last] = pairs[open_last][:, ::-1]
+        n = len(base.vertices)
+        number = n + np.arange(2 * len(ends)).reshape(-1, 2)
+        return base._replace(
+            vertices=np.concatenate([base.vertices, ends.reshape(-1, 3)]),
+            creases=np.concatenate([base.creases, np.column_stack([number, pairs]).astype(np.int32)]),
+            concave=np.concatenate([base.concave, np.ones(len(ends), np.bool_)]),
+        )
+
+    def _intersectors(self) -> Intersector:
+        """Return what finds the first face: of all bodies, or of those that stand still and of those that move."""
+        mesh, moves = self._base, self._moving[self._base.part]
+        if self._still is None:
+            numbers = np.flatnonzero(~moves)
+            self._still = numbers, make_intersector(mesh.vertices.copy(), mesh.faces[numbers], self._kind)
+        if not moves.any():
+            return self._still[1]
+        numbers = np.flatnonzero(moves)
+        moving = numbers, make_intersector(mesh.vertices.copy(), mesh.faces[numbers], self._kind)
+        return moving[1] if len(numbers) == len(moves) else _NearestOf(mesh.planes, (self._still, moving))
+
+
+class _NearestOf:
+    """Finds the first face among several sets of faces."""
+
+    def __init__(self, planes: NDArray[np.float64], sets: Sequence[tuple[NDArray[np.int64], Intersector]]) -> None:
+        self._planes, self._sets = planes, sets
+
+    def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
+        """Return the number of the first face met by each ray, −1 where none is."""
+        found, distance = np.full(len(origins), -1, np.int32), np.full(len(origins), np.inf)
+        for numbers, intersector in self._sets:
+            _keep_nearer(
+                self._planes, numbers, intersector.first_face(origins, directions), origins, directions, found, distance
+            )
+        return found
+
+
+@njit(cache=True)
+def _keep_nearer(planes, numbers, faces, origins, directions, found, distance):  # type: ignore[no-untyped-def]
+    """Replace faces by those that are nearer along the ray."""
+    for i in range(len(faces)):
+        if faces[i] < 0:
+            continue
+        f = numbers[faces[i]]
+        facing, height = 0.0, planes[f, 3]
+        for k in range(3):
+            facing += planes[f, k] * directions[i, k]
+            height -= planes[f, k] * origins[i, k]
+        t = height / facing if facing != 0.0 else 0.0
+        if t < distance[i]:
+            found[i], distance[i] = f, t
+
+
+class _Firsts(NamedTuple):
+    """Where the arrays of each body begin in those of the scene, (b + 1,) each."""
+
+    vertex: NDArray[np.int64]
+    face: NDArray[np.int64]
+    smooth: NDArray[np.int64]
+    fold: NDArray[np.int64]
+    cluster: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, own: Sequence[MeshTopology]) -> _Firsts:
+        """Count the arrays of bodies."""
+        counts = [
+            (len(mesh.vertices), len(mesh.faces), mesh.smooth_planes.shape[1], len(mesh.folds), len(mesh.clusters))
+            for mesh in own
+        ]
+        return cls(*np.cumsum([(0,) * 5, *counts], axis=0).T)
+
+
+def _analysed(bodies: Sequence[Body]) -> list[MeshTopology]:
+    """Analyse the mesh of each body, equal ones once."""
+    known: dict[tuple[bytes, bool], MeshTopology] = {}
+    found = []
+    for body in bodies:
+        mesh: Surface = Surface.of(body)
+        key = mesh_digest(mesh), body.smooth
+        if key not in known:
+            one_albedo = isinstance(body.albedo, float)
+            known[key] = MeshTopology.from_mesh(
+                unite_shells(mesh) if one_albedo else mesh, CREASE_RAD if body.smooth else 0.0
+            )
+        topology = known[key]
+        if isinstance(body.albedo, float):
+            topology = topology._replace(albedo=np.full(len(topology.faces), body.albedo))
+        found.append(topology)
+    return found
+
+
+def _shifted(creases: NDArray[np.int32], vertex: int, face: int) -> NDArray[np.int64]:
+    """Return creases with their vertices and faces renumbered; −1 stays."""
+    ends, sides = creases[:, :2].astype(np.int64), creases[:, 2:].astype(np.int64)
+    return np.concatenate([ends + vertex, np.where(sides >= 0, sides + face, -1)], axis=1)
+
+
+def _turned_planes(
+    planes: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64], sign: float
+) -> NDArray[np.float64]:
+    """Return planes n · p = d, or with sign −1 functions n · p + d, (f, 4), of a body that was turned and moved."""
+    normal = product(planes[:, :3], transposed)
+    return np.column_stack([normal, planes[:, 3] + sign * product(normal, offset[:, None])[:, 0]])

@@ -1,0 +1,269 @@
+"""Bodies of a scene: a mesh or a primitive, its albedo, its name and its pose (PHYSICS section 13)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+from phasemark.render.integral.surface_mesh import SurfaceMesh
+from phasemark.render.rigid import rigid_transforms
+
+SEGMENTS = 64
+"""Sides of the polygon that stands for a circle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Triangles of a body as the renderer asks for them, see :class:`SurfaceMesh`."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    face_attributes: dict[str, Any]
+    metadata: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, body: Body) -> Surface:
+        """Take the mesh of a body, with the albedo of each face if faces have their own."""
+        attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
+        if not isinstance(body.albedo, float):
+            attributes["albedo"] = body.albedo
+        return cls(np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes)
+
+
+_CORNER = (math.pi / SEGMENTS) / math.sin(math.pi / SEGMENTS)
+"""Radius of the polygon's corners, in radii of a circle of the same mean width (Cauchy: perimeter / π)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """A rigid Lambertian body.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        Metres, body frame. An open mesh is seen from both sides.
+    albedo : float or (f,) array_like
+        Of the body, or of each face of the mesh, in [0, 1].
+    name : str
+        Of which a scene has no two; empty: the scene numbers it.
+    pose : (4, 4) array_like
+        Rigid transform body2world.
+    smooth : bool
+        Whether normals are interpolated between faces that meet at less than 30°, as on a mesh that stands for a curved
+        surface; False: every facet is flat.
+
+    Raises
+    ------
+    UsageError
+        The mesh has no faces, a vertex is not finite, an albedo is out of range, or the pose is not rigid.
+
+    Examples
+    --------
+    >>> from phasemark.render import Body
+    >>> import trimesh
+    >>> Body.box((1.0, 1.0, 0.02), pose=trimesh.transformations.translation_matrix((1.5, 0, -0.3)), name="table")
+    Body('table', 12 faces, albedo 0.8, at (1.5, 0, -0.3) m)
+    """
+
+    mesh: SurfaceMesh
+    albedo: float | NDArray[np.float64] = 0.8
+    name: str = ""
+    pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    smooth: bool = True
+
+    def __post_init__(self) -> None:
+        if not (hasattr(self.mesh, "vertices") and hasattr(self.mesh, "faces")):
+            raise UsageError(f"{self._who}: 'mesh' must be a mesh, got {type(self.mesh).__name__}")
+        vertices, faces = np.asarray(self.mesh.vertices, np.float64), np.asarray(self.mesh.faces)
+        if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(faces):
+            raise UsageError(f"{self._who}: 'mesh' must have vertices (v, 3) and at least one face (f, 3)")
+        if not np.isfinite(vertices).all():
+            raise UsageError(f"{self._who}: vertex {int(np.argmin(np.isfinite(vertices).all(axis=1)))} is not finite")
+        if faces.min() < 0 or faces.max() >= len(vertices):
+            raise UsageError(f"{self._who}: a face names a vertex that is not there, counted from 0")
+        albedo = np.asarray(self.albedo, np.float64)
+        if albedo.shape not in ((), (len(faces),)):
+            raise UsageError(
+                f"{self._who}: 'albedo' must be a number or one for each of {len(faces)} faces, got {albedo.shape}"
+            )
+        wrong = albedo[~((albedo >= 0) & (albedo <= 1))]
+        if wrong.size:
+            raise UsageError(f"{self._who}: 'albedo' must be in [0, 1], got {wrong.flat[0]:g}")
+        object.__setattr__(self, "albedo", float(albedo) if albedo.ndim == 0 else albedo)
+        object.__setattr__(self, "pose", rigid_transforms(self.pose, f"pose of {self._who}")[0])
+
+    @property
+    def _who(self) -> str:
+        return f"body '{self.name}'" if self.name else "a body"
+
+    def __repr__(self) -> str:
+        """Describe in one line the body's name, size, albedo and place."""
+        albedo = f"{self.albedo:g}" if isinstance(self.albedo, float) else "of each face"
+        place = ", ".join(f"{x:g}" for x in self.pose[:3, 3])
+        return f"Body('{self.name}', {len(self.mesh.faces)} faces, albedo {albedo}, at ({place}) m)"
+
+    def named(self, name: str) -> Body:
+        """Return the body under another name."""
+        return replace(self, name=name)
+
+    @classmethod
+    def box(cls, size_m: ArrayLike, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None) -> Body:
+        """Return a box around the origin.
+
+        Parameters
+        ----------
+        size_m : (3,) array_like
+            Lengths of its sides along x, y and z.
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        return cls._of(trimesh.creation.box(_lengths(size_m, 3, "size_m")), albedo, name, pose)
+
+    @classmethod
+    def plane(cls, size_m: ArrayLike, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None) -> Body:
+        """Return a rectangle in the plane z = 0 of the body, seen from both sides.
+
+        Parameters
+        ----------
+        size_m : (2,) array_like
+            Lengths of its sides along x and y.
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        x, y = 0.5 * _lengths(size_m, 2, "size_m")
+        corners = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]])
+        return cls._of(trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False), albedo, name, pose)
+
+    @classmethod
+    def sphere(cls, radius_m: float, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None) -> Body:
+        """Return a sphere around the origin, as :meth:`ellipsoid` with three equal half axes."""
+        return cls.ellipsoid((radius_m,) * 3, albedo=albedo, name=name, pose=pose)
+
+    @classmethod
+    def ellipsoid(
+        cls, half_axes_m: ArrayLike, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None
+    ) -> Body:
+        """Return an ellipsoid around the origin.
+
+        Facets lie a little outside of the surface at their corners and a little inside in their middle, so that the
+        outline has the right area on average over all directions (Cauchy's formula).
+
+        Parameters
+        ----------
+        half_axes_m : (3,) array_like
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        half = _lengths(half_axes_m, 3, "half_axes_m")
+        angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, SEGMENTS // 2 + 1)
+        ball = _turned(np.cos(angle), np.sin(angle))
+        ball.vertices = ball.vertices * half * math.sqrt(4 * math.pi / ball.area)
+        return cls._of(ball, albedo, name, pose)
+
+    @classmethod
+    def cylinder(
+        cls, radius_m: float, height_m: float, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None
+    ) -> Body:
+        """Return a cylinder along z around the origin.
+
+        Parameters
+        ----------
+        radius_m, height_m : float
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
+        rho, z = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-0.5, -0.5, 0.5, 0.5])
+        return cls._of(_turned(radius * _CORNER * rho, height * z), albedo, name, pose)
+
+    @classmethod
+    def capsule(
+        cls, radius_m: float, height_m: float, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None
+    ) -> Body:
+        """Return a cylinder along z around the origin with half a sphere at either end.
+
+        Parameters
+        ----------
+        radius_m : float
+        height_m : float
+            Of the cylinder between the half spheres.
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
+        angle = np.linspace(0.0, 0.5 * math.pi, SEGMENTS // 4 + 1)
+        rho, z = radius * _CORNER * np.cos(angle), radius * _CORNER * np.sin(angle) + 0.5 * height
+        return cls._of(_turned([*rho[::-1], *rho], [*-z[::-1], *z]), albedo, name, pose)
+
+    @classmethod
+    def height_field(
+        cls,
+        heights_m: ArrayLike,
+        size_m: ArrayLike,
+        *,
+        base_m: float = 0.1,
+        albedo: float = 0.8,
+        name: str = "",
+        pose: ArrayLike | None = None,
+    ) -> Body:
+        """Return a solid whose top is a height field and whose bottom is flat.
+
+        Parameters
+        ----------
+        heights_m : (rows, cols) array_like
+            z of the top; columns along x, rows along y, both rising.
+        size_m : (2,) array_like
+            Lengths of the sides along x and y; the origin is below the middle.
+        base_m : float
+            How far below z = 0, or the lowest point of the top if that is lower, the bottom lies.
+        albedo, name, pose
+            As for the class; no pose: the identity.
+        """
+        heights = np.asarray(heights_m, np.float64)
+        if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
+            raise UsageError(f"'heights_m' must be finite, (rows, cols) of at least 2 × 2, got {heights.shape}")
+        size, base = _lengths(size_m, 2, "size_m"), float(_lengths((base_m,), 1, "base_m")[0])
+        rows, cols = heights.shape
+        x, y = np.meshgrid(size[0] * np.linspace(-0.5, 0.5, cols), size[1] * np.linspace(-0.5, 0.5, rows))
+        top = np.stack([x, y, heights], axis=-1).reshape(-1, 3)
+        number = np.arange(rows * cols).reshape(rows, cols)
+        a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+        upper = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
+        rim = np.concatenate([number[0, :-1], number[:-1, -1], number[-1, :0:-1], number[:0:-1, 0]])
+        below = top[rim] * [1, 1, 0] - [0, 0, base - min(float(heights.min()), 0.0)]
+        centre = len(top) + len(rim)
+        first = len(top) + np.arange(len(rim))
+        after = np.roll(first, -1)
+        sides = np.concatenate(
+            [
+                np.column_stack([rim, first, after]),
+                np.column_stack([rim, after, np.roll(rim, -1)]),
+                np.column_stack([np.full(len(rim), centre), after, first]),
+            ]
+        )
+        middle = np.array([[0.0, 0.0, below[0, 2]]])
+        solid = trimesh.Trimesh(np.concatenate([top, below, middle]), np.concatenate([upper, sides]), process=False)
+        return cls._of(solid, albedo, name, pose)
+
+    @classmethod
+    def _of(cls, mesh: trimesh.Trimesh, albedo: float, name: str, pose: ArrayLike | None) -> Body:
+        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose))
+
+
+def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
+    """Return n positive lengths."""
+    found = np.asarray(values, np.float64)
+    if found.shape != (n,) or not (np.isfinite(found) & (found > 0)).all():
+        raise UsageError(f"'{name}' must be {n} positive number{'s' * (n > 1)} of metres, got {values!r}")
+    return found
+
+
+def _turned(radius_m: ArrayLike, z_m: ArrayLike) -> trimesh.Trimesh:
+    """Return a solid of revolution about z from its profile, bottom to top."""
+    return trimesh.creation.revolve(np.column_stack([radius_m, z_m]), sections=SEGMENTS)

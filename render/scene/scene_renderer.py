@@ -1,0 +1,255 @@
+"""Renders scenes from any camera pose, with the share of each pixel that each body fills."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+from phasemark.render.background import Background, parameters_of_views
+from phasemark.render.direct.bin_counts import detected_counts
+from phasemark.render.direct.footprints import footprint_grid, histogram_of
+from phasemark.render.direct.histogram_images import HistogramImages
+from phasemark.render.direct.sample_counts import signal_of_samples
+from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.direct.transients import zone_shares
+from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
+from phasemark.render.integral.arguments import Poses
+from phasemark.render.integral.ray_plan import UNTRUSTED
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.rigid import product, rigid_transforms
+from phasemark.render.scene.assembly import Assembly
+from phasemark.render.scene.scene import Scene
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.threads import mapped
+
+_TOUCH_M = 1e-9
+_MOST_BYTES = 4 << 30
+"""Of the shares of one call."""
+
+
+class SceneRenderer:
+    """Renders a scene with one camera, from any pose.
+
+    Parameters
+    ----------
+    scene : Scene
+    sensor : Sensor
+        The camera.
+    harmonics : sequence of int, optional
+        As for :class:`~phasemark.render.Renderer`.
+    intersector : {"auto", "embree", "float64"}
+        As for :class:`~phasemark.render.Renderer`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from phasemark.render import Body, Scene, SceneRenderer, preset
+    >>> wall = np.eye(4)
+    >>> wall[:3, 3] = 2.0, 0.0, 0.0
+    >>> scene = Scene([Body.box((0.1, 4, 4), name="wall", pose=wall)])
+    >>> images = SceneRenderer(scene, preset("pmd-16x16")).render(np.eye(4))
+    >>> images.range_m[0, 8, 8].round(3), images.shares.shape, float(images.shares.min())
+    (np.float64(1.95), (1, 16, 16, 1), 1.0)
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        sensor: Sensor,
+        *,
+        harmonics: Sequence[int] | None = None,
+        intersector: str = "auto",
+    ) -> None:
+        if not isinstance(scene, Scene):
+            raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
+        self.scene = scene
+        self.sensor = sensor
+        self._harmonics = tuple(sensor.harmonic_orders if harmonics is None else harmonics)
+        self._assembly = Assembly(scene.bodies, intersector)
+        self.untrusted_pixels = 0
+        """How many pixels, of all rendered so far, had too many edges to be split exactly."""
+
+    def __repr__(self) -> str:
+        """Describe in one line the scene and the camera."""
+        return f"SceneRenderer({self.scene!r}, {self.sensor!r})"
+
+    def render(
+        self,
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None = None,
+        background: Background | None = None,
+        *,
+        workers: int = 1,
+    ) -> PhasorImages | HistogramImages:
+        """Render frames.
+
+        Parameters
+        ----------
+        camera2world : (4, 4) or (n, 4, 4) array_like
+            Poses of the camera's mount: x forward, y left, z up (PHYSICS section 9). The sensor's own pitch and roll
+            come before them.
+        bodies2world : (b, 4, 4) or (n, b, 4, 4) array_like, or a mapping from names to (4, 4) or (n, 4, 4), optional
+            Where the bodies stand; None: where the scene has them. Only what moves from frame to frame is rebuilt.
+        background : Background, optional
+            A wall and a floor behind all bodies, level, the wall perpendicular to the way the camera looks.
+        workers : int
+            Threads; the result does not depend on their number.
+
+        Returns
+        -------
+        PhasorImages or HistogramImages
+            n images with ``shares``, (n, rows, cols, b): the part of each pixel's active area that each body fills.
+            Histograms with a direct sensor, one with a [histogram] table.
+
+        Raises
+        ------
+        UsageError
+            A pose is not rigid, the lens is inside a closed body, or a body reaches through the background.
+        """
+        if self.sensor.histogram is None:
+            return self.phasors(camera2world, bodies2world, background, workers=workers)
+        return self.histograms(camera2world, bodies2world, background, workers=workers)
+
+    def phasors(
+        self,
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None = None,
+        background: Background | None = None,
+        *,
+        workers: int = 1,
+    ) -> PhasorImages:
+        """Render the phasors of frames with any camera; see :meth:`render`."""
+        n, b = self._counts(camera2world)
+        shape = n, self.sensor.rows, self.sensor.cols
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
+        sums = no_light(shape, len(columns_hz), b)
+
+        def integrate(assembly: Assembly, which: NDArray[np.int64], poses: Poses, threads: int) -> None:
+            integral = AreaIntegral(assembly.topology, assembly.intersector, self.sensor, harmonics=self._harmonics)
+            found = integral.sums(poses, n_parts=b, workers=threads)
+            pixels = (which[:, None] * shape[1] * shape[2] + np.arange(shape[1] * shape[2])).ravel()
+            for own, new in zip(sums[:4], found[:4], strict=True):
+                own[pixels] = new
+            sums.state[which] = found.state
+
+        self._for_each_placing(integrate, camera2world, bodies2world, background, workers)
+        self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
+        return replace(
+            images_of_sums(sums, self.sensor, self._harmonics),
+            shares=np.minimum(sums.shares.reshape(*shape, b), 1.0),
+            bodies=self.scene.names,
+        )
+
+    def histograms(
+        self,
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None = None,
+        background: Background | None = None,
+        *,
+        workers: int = 1,
+    ) -> HistogramImages:
+        """Render the histograms of frames with a direct sensor; see :meth:`render`."""
+        n, b = self._counts(camera2world)
+        sensor, histogram, grid = self.sensor, histogram_of(self.sensor), footprint_grid(self.sensor)
+        finest_m, farthest_m = 0.5 * histogram.bin_width_m, histogram.start_m + 1.1 * histogram.length_m
+        zones = sensor.rows * sensor.cols
+        signal = np.zeros((n, zones, histogram.bins))
+        shares = np.zeros((n, zones, b))
+
+        def count(assembly: Assembly, which: NDArray[np.int64], poses: Poses, threads: int) -> None:
+            surface = SceneMesh.of_surface(assembly.topology, assembly.intersector, b)
+
+            def run(k: int) -> None:
+                samples = surface.samples_of_poses(of_poses(poses, slice(k, k + 1)), grid, finest_m, farthest_m)
+                shares[which[k]] = zone_shares(samples, sensor, b)[0]
+                samples = samples._replace(part=np.zeros_like(samples.part))
+                signal[which[k]] = signal_of_samples(samples, sensor, 1.0)[0]
+
+            mapped(run, range(len(which)), threads)
+
+        self._for_each_placing(count, camera2world, bodies2world, background, workers)
+        shape = n, sensor.rows, sensor.cols
+        return HistogramImages(
+            detected_counts(signal, sensor).reshape(*shape, -1),
+            signal.sum(axis=-1).reshape(shape),
+            sensor,
+            shares=shares.reshape(*shape, b),
+            bodies=self.scene.names,
+        )
+
+    def _counts(self, camera2world: ArrayLike) -> tuple[int, int]:
+        """Return how many frames and bodies there are; refuse more than fit into memory."""
+        n, b = len(rigid_transforms(camera2world, "camera2world")), len(self.scene)
+        pixels = self.sensor.rows * self.sensor.cols
+        if 8 * n * b * pixels > _MOST_BYTES:
+            raise UsageError(
+                f"the shares of {b} bodies in {n} frames take {8 * n * b * pixels / 2**30:.0f} GiB: render at most"
+                f" {max(_MOST_BYTES // (8 * b * pixels), 1)} frames at a time"
+            )
+        return n, b
+
+    def _for_each_placing(
+        self,
+        use: Callable[[Assembly, NDArray[np.int64], Poses, int], None],
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None,
+        background: Background | None,
+        workers: int,
+    ) -> None:
+        """Call `use` once for all frames in which the bodies stand alike, from several threads where they do not."""
+        if workers < 1:
+            raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        cameras = rigid_transforms(camera2world, "camera2world")
+        n = len(cameras)
+        placings = self.scene.posed(bodies2world, n)
+        alike: dict[bytes, list[int]] = {}
+        for k in range(n):
+            alike.setdefault(placings[k].tobytes(), []).append(k)
+        frames = [np.array(which) for which in alike.values()]
+        lanes = [lane for i in range(min(workers, len(frames))) if (lane := frames[i::workers])]
+        threads = max(workers // max(len(lanes), 1), 1)
+
+        def run(lane: list[NDArray[np.int64]]) -> None:
+            assembly = self._assembly if len(lanes) == 1 else self._assembly.copy()
+            for which in lane:
+                assembly.place(placings[which[0]])
+                assembly.check_outside(cameras[which, :3, 3], self.scene.names, which)
+                use(assembly, which, self._poses(assembly, cameras[which], background), threads)
+
+        mapped(run, lanes, len(lanes))
+
+    def _poses(self, assembly: Assembly, cameras: NDArray[np.float64], background: Background | None) -> Poses:
+        """Return the poses of the world before cameras."""
+        rotation, lens = cameras[:, :3, :3], cameras[:, :3, 3]
+        world2camera = np.zeros_like(cameras)
+        world2camera[:, :3, :3] = rotation.transpose(0, 2, 1)
+        world2camera[:, :3, 3] = -product(lens[:, None], rotation)[:, 0]
+        behind = parameters_of_views(background, len(cameras))
+        yaw = np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
+        level2world = np.zeros_like(rotation)
+        level2world[:, 0, 0] = level2world[:, 1, 1] = np.cos(yaw)
+        level2world[:, 1, 0], level2world[:, 2, 2] = np.sin(yaw), 1.0
+        level2world[:, 0, 1] = -level2world[:, 1, 0]
+        if background is not None:
+            self._check_before(assembly, background, level2world, lens)
+        poses = camera_poses(world2camera, self.sensor.cam2level, behind)
+        level = product(product(level2world.transpose(0, 2, 1), rotation), self.sensor.cam2level)
+        return poses._replace(lens=np.ascontiguousarray(lens), level=level)
+
+    def _check_before(
+        self, assembly: Assembly, background: Background, level2world: NDArray[np.float64], lens: NDArray[np.float64]
+    ) -> None:
+        """Refuse bodies that reach through the background."""
+        wall, floor = background.wall_m, background.floor_m
+        vertices = assembly.topology.vertices
+        for turn, origin in zip(level2world, lens, strict=True):
+            ahead = product(vertices - origin, turn)
+            if wall is not None and ahead[:, 0].max() > wall + _TOUCH_M:
+                raise UsageError(f"a body reaches {ahead[:, 0].max():.4g} m ahead, through the wall at {wall:g} m")
+            if floor is not None and ahead[:, 2].min() < -floor - _TOUCH_M:
+                raise UsageError(f"a body reaches {-ahead[:, 2].min():.4g} m down, through the floor at {floor:g} m")
