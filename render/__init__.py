@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from phasemark.render.bench.data_sheet.characterise import characterise
     from phasemark.render.direct.capture import capture
     from phasemark.render.scene.body import Body
+    from phasemark.render.scene.depth_zones import zones_from_depth
     from phasemark.render.scene.scene import Scene
     from phasemark.render.scene.scene_renderer import SceneRenderer
     from phasemark.render.sensor.camera_unit import camera_unit
@@ -51,6 +52,7 @@ __all__ = [
     "preset_names",
     "unwrap_ranges",
     "unwrapping_error_probability",
+    "zones_from_depth",
 ]
 
 

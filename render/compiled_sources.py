@@ -25,7 +25,7 @@ _FOLDERS = {
         "bin_counts expected_targets fit_model footprints photon_counts sample_counts scene_samples targets transients"
     ),
     "render/exposure": "capture photoelectrons random_streams taps",
-    "render/scene": "assembly crossings",
+    "render/scene": "assembly crossings depth_slopes",
     "render/integral": (
         "arguments bent_edges borders circular components edge_motion edge_projection edges_in_pixels"
         " face_search floor_phase image_rays intersect intervals light limbs mesh_topology pixel_splitting"
