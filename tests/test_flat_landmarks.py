@@ -106,6 +106,12 @@ def test_views_edge_on_leave_room_for_the_lens_and_move_a_wall_back(bank):
     np.testing.assert_allclose(view[:, 0], [0.6, WIDE_M / 2 + 5e-3])
     images = model.images(np.zeros(2, np.int64), view, ())
     assert np.isfinite(images.phasor).all()
+    # turned where it stands, its far end reaches the wall: a search tries that
+    before = np.array([[0.0, 0.3, 0, 0, 0, 0]])
+    before[:, 0] = model.limits(before[:, 1])[1]
+    image = model.images(np.zeros(1, np.int64), before, ())
+    turned = model.turned(np.zeros(1, np.int64), before + np.array([0, 0.05, 0, 0, 0, 0]), image)
+    assert np.isfinite(turned.phasor).all()
 
 
 def test_tilts_before_a_wide_panel_are_known_or_free_with_a_coarse_bank(bank):

@@ -261,26 +261,17 @@ class RenderedModel(ImageModel):
         return [self._backgrounds[k] for k in self._frame[which]]
 
     def _given_way(self, class_index: int, views: Views, which: NDArray[np.integer]) -> Backgrounds:
-        """Return the backgrounds of some views, floors lowered to where the landmark ends.
+        """Return the backgrounds of some views, walls and floors that the landmark would reach through moved back.
 
-        Floors are estimated, and heights are tried. So are views edge on to a wide landmark that reaches a wall.
+        Floors are estimated, and heights are tried. So are sides of a landmark whose far end then reaches a wall.
         """
-        if not self._floors:
-            given = self._backgrounds[0] if self._frame is None else self._behind(which)
-            nearest, farthest = self.limits(views.delta_rad, which)
-            cut = np.isfinite(self._wall_m).any() & (nearest > farthest)
-            if not cut.any():
-                return given
-            vertices, seen = self._renderers[class_index].topology.vertices, views.in_camera(self.sensor)
-            return [
-                behind.giving_way(vertices, seen[np.array([k])]) if behind is not None and cut[k] else behind
-                for k, behind in enumerate(self._behind(which))
-            ]
-        lowest_m = float(self._renderers[class_index].topology.vertices[:, 2].min())
-        least_m = -(lowest_m + views.in_camera(self.sensor).height_m)
-        return [
-            replace(background, floor_m=float(least))
-            if background is not None and background.floor_m is not None and background.floor_m < least
-            else background
-            for background, least in zip(self._behind(which), least_m, strict=True)
-        ]
+        vertices, seen = self._renderers[class_index].topology.vertices, views.in_camera(self.sensor)
+        nearest, farthest = self.limits(views.delta_rad, which)
+        cut = np.isfinite(self._wall_m).any() & ((nearest > farthest) | (views.distance_m > farthest))
+        if not self._floors and not cut.any():
+            return self._backgrounds[0] if self._frame is None else self._behind(which)
+        behind, least_m = self._behind(which), -(float(vertices[:, 2].min()) + seen.height_m)
+        for k, own in enumerate(behind):
+            if own is not None and (cut[k] or (own.floor_m is not None and own.floor_m < least_m[k])):
+                behind[k] = own.giving_way(vertices, seen[np.array([k])])
+        return behind
