@@ -331,7 +331,7 @@ _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 def mesh_digest(mesh: SurfaceMesh) -> bytes:
     """Return a digest of all that a renderer asks of a mesh."""
-    attributes = (mesh.face_attributes.get(name, ()) for name in ("part", "albedo"))
+    attributes = (mesh.face_attributes.get(name, ()) for name in ("part", "albedo", "normals", "points"))
     digest = hashlib.blake2b()
     for array in (mesh.vertices, mesh.faces, *attributes):
         values = np.ascontiguousarray(array)

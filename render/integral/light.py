@@ -156,6 +156,12 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
         pz = u * vertices[a, 2] + v * vertices[b, 2] + w * vertices[c, 2]
         along = (px - ox) * dx + (py - oy) * dy + (pz - oz) * dz
         t = along / (dx * dx + dy * dy + dz * dz)
+    rise = u * normals[9] + v * normals[10] + w * normals[11]
+    rise += u * v * normals[12] + v * w * normals[13] + w * u * normals[14]
+    if rise != 0.0:
+        grazing = 0.3  # below this cosine what a surface rises is as far along it as the face is long
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        t -= rise / max(abs(facing), grazing * length)
     nx = u * normals[0] + v * normals[3] + w * normals[6]
     ny = u * normals[1] + v * normals[4] + w * normals[7]
     nz = u * normals[2] + v * normals[5] + w * normals[8]

@@ -37,7 +37,9 @@ class MeshTopology(NamedTuple):
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
     corner_normals : (f, 16) float32
-        Shading normal at each corner of each face (9), zero at an apex, where there is none; the rest is empty.
+        Shading normal at each corner of each face (9), zero at an apex, where there is none; how far the true surface
+        lies before the face at its corners (3), and what it rises further between them, of corners 0 and 1, 1 and 2, 2
+        and 0 (3), zero where only the mesh is known; the rest is empty.
     flat : (f,) bool
         Whether the three corner normals are the face's own.
     plain : (f,) bool
@@ -82,6 +84,8 @@ class MeshTopology(NamedTuple):
     split : bool
         Whether the face that is seen changes at creases and silhouettes only: surfaces pass through one another
         nowhere but along creases.
+    around : bool
+        Whether the surface may stand around the camera, so that it is seen beyond all of its edges.
     """
 
     vertices: NDArray[np.float64]
@@ -106,6 +110,7 @@ class MeshTopology(NamedTuple):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     split: bool
+    around: bool
 
     @classmethod
     def from_mesh(cls, mesh: SurfaceMesh, crease_rad: float = CREASE_RAD) -> MeshTopology:
@@ -148,7 +153,14 @@ class MeshTopology(NamedTuple):
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
-        corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
+        rises = np.zeros((len(faces), 6))
+        if "normals" in mesh.face_attributes:
+            corners, points = (
+                np.asarray(mesh.face_attributes[k], dtype=np.float64)[kept] for k in ("normals", "points")
+            )
+            rises = _rises(vertices[faces], corners, points)
+        else:
+            corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
@@ -170,7 +182,7 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_normals=in_lines(corners.reshape(-1, 9)),
+            corner_normals=in_lines(np.column_stack([corners.reshape(-1, 9), rises])),
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
@@ -191,6 +203,7 @@ class MeshTopology(NamedTuple):
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
             split=closed,
+            around=False,
         )
 
     @classmethod
@@ -219,6 +232,7 @@ class MeshTopology(NamedTuple):
             low=np.zeros(3),
             high=np.zeros(3),
             split=True,
+            around=False,
         )
 
 
@@ -368,6 +382,18 @@ def _corner_normals(
     corner_of = np.argsort(faces.ravel(), kind="stable")
     start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
     return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(crease_rad + 1e-9)))
+
+
+def _rises(
+    corners: NDArray[np.float64], normals: NDArray[np.float64], points: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far the true surface lies before faces, (f, 6), from its points and normals at their corners.
+
+    Between two corners a curve with these normals rises in its middle by an eighth of (n' − n) · (p' − p).
+    """
+    after, beyond = np.roll(normals, -1, axis=1), np.roll(points, -1, axis=1)
+    offset = np.einsum("fkx,fkx->fk", normals, points - corners)
+    return np.concatenate([offset, 0.5 * np.einsum("fkx,fkx->fk", after - normals, beyond - points)], axis=1)
 
 
 @njit(cache=True)

@@ -73,6 +73,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
         if n_edges < 0:
             return SHORT_SEGMENTS, n
         u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
+        if mesh.around:
+            u_low, u_high, v_low, v_high = -np.inf, np.inf, -np.inf, np.inf
         bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
         background = poses.background[view]

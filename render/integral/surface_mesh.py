@@ -22,7 +22,11 @@ class SurfaceMesh(Protocol):
 
     @property
     def face_attributes(self) -> Mapping[str, Any]:
-        """``part``, where it is known: 0 for faces of the lower part, 1 for faces of the upper one, (f,)."""
+        """What is known of faces.
+
+        ``part``: 0 for faces of the lower part, 1 for faces of the upper one, (f,). ``albedo`` of each, (f,).
+        ``normals`` and ``points`` of the true surface at their corners, (f, 3, 3).
+        """
 
     @property
     def metadata(self) -> Mapping[str, Any]:

@@ -145,10 +145,11 @@ class Assembly:
             folds=np.ascontiguousarray(np.concatenate(folds), np.int32),
             first_fold=np.append(np.concatenate(begins), first.fold[-1]).astype(np.int32),
             smooth_planes=np.empty((5, n_smooth)),
-            clusters=np.concatenate([mesh.clusters for mesh in own]),
+            clusters=np.concatenate([_from_smooth(mesh.clusters, first.smooth[b]) for b, mesh in enumerate(own)]),
             low=np.zeros(3),
             high=np.zeros(3),
             split=True,
+            around=True,
         )
 
     def _turn(self, moved: NDArray[np.int64]) -> None:
@@ -160,6 +161,7 @@ class Assembly:
             smooth, cluster = slice(*first.smooth[b : b + 2]), slice(*first.cluster[b : b + 2])
             mesh.vertices[vertex] = product(own.vertices, transposed) + offset
             mesh.planes[face] = _turned_planes(own.planes, transposed, offset, 1.0)
+            mesh.corner_normals[face] = own.corner_normals
             mesh.corner_normals[face, :9] = product(own.corner_normals[:, :9].reshape(-1, 3), transposed).reshape(-1, 9)
             mesh.search[face, :4] = mesh.planes[face]
             shares = own.search[:, 4:12].astype(np.float64).reshape(-1, 4)
@@ -296,6 +298,13 @@ def _shifted(creases: NDArray[np.int32], vertex: int, face: int) -> NDArray[np.i
     """Return creases with their vertices and faces renumbered; −1 stays."""
     ends, sides = creases[:, :2].astype(np.int64), creases[:, 2:].astype(np.int64)
     return np.concatenate([ends + vertex, np.where(sides >= 0, sides + face, -1)], axis=1)
+
+
+def _from_smooth(clusters: NDArray[np.float64], smooth: int) -> NDArray[np.float64]:
+    """Return clusters of faces that begin later among the smooth faces."""
+    later = clusters.copy()
+    later[:, 11] += smooth
+    return later
 
 
 def _turned_planes(

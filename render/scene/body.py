@@ -14,7 +14,7 @@ from phasemark import UsageError
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.rigid import rigid_transforms
 
-SEGMENTS = 64
+SEGMENTS = 96
 """Sides of the polygon that stands for a circle."""
 
 
@@ -33,6 +33,9 @@ class Surface:
         attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
+        known = getattr(body.mesh, "face_attributes", {})
+        if body.smooth and "normals" in known and "points" in known:
+            attributes |= {name: known[name] for name in ("normals", "points")}
         return cls(np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes)
 
 
@@ -164,7 +167,8 @@ class Body:
         angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, SEGMENTS // 2 + 1)
         ball = _turned(np.cos(angle), np.sin(angle))
         ball.vertices = ball.vertices * half * math.sqrt(4 * math.pi / ball.area)
-        return cls._of(ball, albedo, name, pose)
+        points = half * _unit(ball.triangles / half)
+        return cls._of(_true_surface(ball, points / half**2, points), albedo, name, pose)
 
     @classmethod
     def cylinder(
@@ -180,7 +184,11 @@ class Body:
         """
         radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
         rho, z = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-0.5, -0.5, 0.5, 0.5])
-        return cls._of(_turned(radius * _CORNER * rho, height * z), albedo, name, pose)
+        solid = _turned(radius * _CORNER * rho, height * z)
+        ends = np.abs(solid.face_normals[:, 2]) > math.sqrt(0.5)
+        along = np.where(ends[:, None, None], solid.face_normals[:, None], solid.triangles * [1.0, 1.0, 0.0])
+        points = np.where(ends[:, None, None], solid.triangles, solid.triangles / [_CORNER, _CORNER, 1.0])
+        return cls._of(_true_surface(solid, along, points), albedo, name, pose)
 
     @classmethod
     def capsule(
@@ -199,7 +207,11 @@ class Body:
         radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
         angle = np.linspace(0.0, 0.5 * math.pi, SEGMENTS // 4 + 1)
         rho, z = radius * _CORNER * np.cos(angle), radius * _CORNER * np.sin(angle) + 0.5 * height
-        return cls._of(_turned([*rho[::-1], *rho], [*-z[::-1], *z]), albedo, name, pose)
+        solid = _turned([*rho[::-1], *rho], [*-z[::-1], *z])
+        middle = solid.triangles * [0.0, 0.0, 1.0]
+        middle = np.clip(middle, -0.5 * height, 0.5 * height)
+        along = solid.triangles - middle
+        return cls._of(_true_surface(solid, along, middle + radius * _unit(along)), albedo, name, pose)
 
     @classmethod
     def height_field(
@@ -267,3 +279,14 @@ def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
 def _turned(radius_m: ArrayLike, z_m: ArrayLike) -> trimesh.Trimesh:
     """Return a solid of revolution about z from its profile, bottom to top."""
     return trimesh.creation.revolve(np.column_stack([radius_m, z_m]), sections=SEGMENTS)
+
+
+def _true_surface(mesh: trimesh.Trimesh, along: NDArray[np.float64], points: NDArray[np.float64]) -> trimesh.Trimesh:
+    """Give the corners of each face, (f, 3, 3), normals of any length and points of the true surface."""
+    mesh.face_attributes["normals"], mesh.face_attributes["points"] = _unit(along), points
+    return mesh
+
+
+def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return vectors of length 1."""
+    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
