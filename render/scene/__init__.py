@@ -1,4 +1,4 @@
-"""Scenes: several bodies, their materials, a camera anywhere, and depth images of other programs (PHYSICS section 13)."""
+"""Scenes: bodies, their materials, a camera anywhere, and depth images of other programs (PHYSICS section 13)."""
 
 from typing import TYPE_CHECKING
 
