@@ -331,9 +331,9 @@ _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 def mesh_digest(mesh: SurfaceMesh) -> bytes:
     """Return a digest of all that a renderer asks of a mesh."""
-    attributes = (mesh.face_attributes.get(name, ()) for name in ("part", "albedo", "normals", "points"))
+    attributes = [mesh.face_attributes.get(name, ()) for name in ("part", "albedo", "quadric")]
     digest = hashlib.blake2b()
-    for array in (mesh.vertices, mesh.faces, *attributes):
+    for array in (mesh.vertices, mesh.faces, *attributes, mesh.metadata.get("quadrics", ())):
         values = np.ascontiguousarray(array)
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(values.tobytes())

@@ -123,6 +123,8 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
     """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
     dx, dy, dz = towards_landmark(matrix, y, z)
     ox, oy, oz = lens[0], lens[1], lens[2]
+    if mesh.quadric[face] >= 0:
+        return _quadric_hit(mesh, face, ox, oy, oz, dx, dy, dz)
     if not mesh.flat[face]:
         return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
     nx, ny, nz, d = mesh.planes[face, 0], mesh.planes[face, 1], mesh.planes[face, 2], mesh.planes[face, 3]
@@ -131,6 +133,32 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
     if t > 0.0:
         return t, abs(facing)
     return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
+
+
+@kernel
+def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return the multiple of the ray at its hit with the face's quadric, and |cos θ| there times the ray's length.
+
+    Facets reach a little beyond the outline of the quadric; a ray that misses it there grazes it.
+    """
+    q, own = mesh.quadrics[mesh.quadric[f]], mesh.planes[f]
+    gx = q[0] * dx + q[3] * dy + q[4] * dz
+    gy = q[3] * dx + q[1] * dy + q[5] * dz
+    gz = q[4] * dx + q[5] * dy + q[2] * dz
+    hx = q[0] * ox + q[3] * oy + q[4] * oz + q[6]
+    hy = q[3] * ox + q[1] * oy + q[5] * oz + q[7]
+    hz = q[4] * ox + q[5] * oy + q[2] * oz + q[8]
+    a, b = dx * gx + dy * gy + dz * gz, dx * hx + dy * hy + dz * hz
+    c = ox * (hx + q[6]) + oy * (hy + q[7]) + oz * (hz + q[8]) + q[9]
+    if a <= 0.0:  # along the axis of a cylinder
+        return _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz)
+    root = math.sqrt(max(b * b - a * c, 0.0))
+    facing = own[0] * dx + own[1] * dy + own[2] * dz
+    on_face = (own[3] - own[0] * ox - own[1] * oy - own[2] * oz) / facing if facing != 0.0 else 0.0
+    t = (-b - root) / a if a * on_face < -b else (-b + root) / a  # whichever is nearer to the facet
+    nx, ny, nz = hx + t * gx, hy + t * gy, hz + t * gz
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return t, root / size
 
 
 @kernel
@@ -156,12 +184,6 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
         pz = u * vertices[a, 2] + v * vertices[b, 2] + w * vertices[c, 2]
         along = (px - ox) * dx + (py - oy) * dy + (pz - oz) * dz
         t = along / (dx * dx + dy * dy + dz * dz)
-    rise = u * normals[9] + v * normals[10] + w * normals[11]
-    rise += u * v * normals[12] + v * w * normals[13] + w * u * normals[14]
-    if rise != 0.0:
-        grazing = 0.3  # below this cosine what a surface rises is as far along it as the face is long
-        length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        t -= rise / max(abs(facing), grazing * length)
     nx = u * normals[0] + v * normals[3] + w * normals[6]
     ny = u * normals[1] + v * normals[4] + w * normals[7]
     nz = u * normals[2] + v * normals[5] + w * normals[8]

@@ -37,13 +37,11 @@ class MeshTopology(NamedTuple):
     planes : (f, 4) float64
         Unit normal and offset of each face: n · p = offset on it.
     corner_normals : (f, 16) float32
-        Shading normal at each corner of each face (9), zero at an apex, where there is none; how far the true surface
-        lies before the face at its corners (3), and what it rises further between them, of corners 0 and 1, 1 and 2, 2
-        and 0 (3), zero where only the mesh is known; the rest is empty.
+        Shading normal at each corner of each face (9), zero at an apex, where there is none; the rest is empty.
     flat : (f,) bool
         Whether the three corner normals are the face's own.
     plain : (f,) bool
-        Whether all faces of the face's smooth patch are flat, which makes the patch a plane.
+        Whether all faces of the face's smooth patch are one surface: a plane, where they are flat, or a quadric.
     patch : (f,) int32
         Number of the smooth patch, faces joined without a crease between them.
     searched : (f,) bool
@@ -60,6 +58,10 @@ class MeshTopology(NamedTuple):
         number of the body.
     albedo : (f,) float64
         Of each face, relative to that of the surface.
+    quadric : (f,) int32
+        Which quadric is the true surface of the face, −1 for none.
+    quadrics : (q, 10) float64
+        A (xx, yy, zz, xy, xz, yz), b (3) and c of surfaces pᵀ A p + 2 b · p + c = 0, negative inside.
     closed : (f,) bool
         Whether the face belongs to a shell that is watertight and wound outward, so that its back is never seen.
     concave : (e,) bool
@@ -100,6 +102,8 @@ class MeshTopology(NamedTuple):
     grid: FaceGrid
     part: NDArray[np.int32]
     albedo: NDArray[np.float64]
+    quadric: NDArray[np.int32]
+    quadrics: NDArray[np.float64]
     closed: NDArray[np.bool_]
     creases: NDArray[np.int32]
     concave: NDArray[np.bool_]
@@ -134,6 +138,7 @@ class MeshTopology(NamedTuple):
         faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
+        quadric = np.asarray(mesh.face_attributes.get("quadric", np.full(len(faces), -1)), dtype=np.int32)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -143,29 +148,23 @@ class MeshTopology(NamedTuple):
             raise UsageError("the mesh has no face with an area")
         kept = np.flatnonzero(kept)
         kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
-        faces, part, albedo, a = faces[kept], part[kept], albedo[kept], a[kept]
+        faces, part, albedo, quadric, a = faces[kept], part[kept], albedo[kept], quadric[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
         edges, regular = _edges(faces)
         first, other = edges[:, 2], edges[:, 3]
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
-        crease = ~regular | (turn > crease_rad + 1e-9) | (albedo[first] != albedo[other])
+        crease = ~regular | (turn > crease_rad + 1e-9)
+        crease |= (albedo[first] != albedo[other]) | (quadric[first] != quadric[other])
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
-        rises = np.zeros((len(faces), 6))
-        if "normals" in mesh.face_attributes:
-            corners, points = (
-                np.asarray(mesh.face_attributes[k], dtype=np.float64)[kept] for k in ("normals", "points")
-            )
-            rises = _rises(vertices[faces], corners, points)
-        else:
-            corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
+        corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
         rise = np.einsum("ij,ij->i", planes[first, :3], off_edge) - planes[first, 3]
-        plain = np.bincount(patch, ~flat)[patch] == 0
+        plain = (np.bincount(patch, ~flat)[patch] == 0) | (quadric >= 0)  # one surface for the whole patch
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
         hollow = np.bincount(patch[first], ~crease & (rise > _HOLLOW * extent), minlength=patch.max() + 1)[patch] > 0
@@ -182,7 +181,7 @@ class MeshTopology(NamedTuple):
             vertices=np.ascontiguousarray(vertices),
             faces=np.ascontiguousarray(faces, dtype=np.int32),
             planes=np.ascontiguousarray(planes),
-            corner_normals=in_lines(np.column_stack([corners.reshape(-1, 9), rises])),
+            corner_normals=in_lines(corners.reshape(-1, 9)),
             flat=np.ascontiguousarray(flat),
             plain=plain,
             patch=patch,
@@ -193,6 +192,8 @@ class MeshTopology(NamedTuple):
             grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
             albedo=np.ascontiguousarray(albedo),
+            quadric=np.ascontiguousarray(quadric),
+            quadrics=np.asarray(mesh.metadata.get("quadrics", np.zeros((0, 10))), np.float64),
             closed=np.full(len(faces), closed),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(rise[crease] > 0),
@@ -222,6 +223,8 @@ class MeshTopology(NamedTuple):
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int32),
             albedo=np.zeros(0),
+            quadric=np.zeros(0, np.int32),
+            quadrics=np.zeros((0, 10)),
             closed=np.zeros(0, np.bool_),
             creases=np.zeros((0, 4), np.int32),
             concave=np.zeros(0, np.bool_),
@@ -382,18 +385,6 @@ def _corner_normals(
     corner_of = np.argsort(faces.ravel(), kind="stable")
     start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
     return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(crease_rad + 1e-9)))
-
-
-def _rises(
-    corners: NDArray[np.float64], normals: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how far the true surface lies before faces, (f, 6), from its points and normals at their corners.
-
-    Between two corners a curve with these normals rises in its middle by an eighth of (n' − n) · (p' − p).
-    """
-    after, beyond = np.roll(normals, -1, axis=1), np.roll(points, -1, axis=1)
-    offset = np.einsum("fkx,fkx->fk", normals, points - corners)
-    return np.concatenate([offset, 0.5 * np.einsum("fkx,fkx->fk", after - normals, beyond - points)], axis=1)
 
 
 @njit(cache=True)

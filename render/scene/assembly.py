@@ -70,6 +70,7 @@ class Assembly:
             search=in_lines(base.search),
             smooth_planes=base.smooth_planes.copy(),
             clusters=base.clusters.copy(),
+            quadrics=base.quadrics.copy(),
         )
         return other
 
@@ -139,6 +140,10 @@ class Assembly:
             grid=own[0].grid if alone else _NO_GRID,
             part=np.repeat(np.arange(len(own)), np.diff(first.face)).astype(np.int32),
             albedo=np.concatenate([mesh.albedo for mesh in own]),
+            quadric=np.concatenate(
+                [np.where(mesh.quadric >= 0, mesh.quadric + first.quadric[b], -1) for b, mesh in enumerate(own)]
+            ).astype(np.int32),
+            quadrics=np.empty((first.quadric[-1], 10)),
             closed=np.concatenate([mesh.closed for mesh in own]),
             creases=np.ascontiguousarray(np.concatenate(creases), np.int32),
             concave=np.concatenate([mesh.concave for mesh in own]),
@@ -161,13 +166,13 @@ class Assembly:
             smooth, cluster = slice(*first.smooth[b : b + 2]), slice(*first.cluster[b : b + 2])
             mesh.vertices[vertex] = product(own.vertices, transposed) + offset
             mesh.planes[face] = _turned_planes(own.planes, transposed, offset, 1.0)
-            mesh.corner_normals[face] = own.corner_normals
             mesh.corner_normals[face, :9] = product(own.corner_normals[:, :9].reshape(-1, 3), transposed).reshape(-1, 9)
             mesh.search[face, :4] = mesh.planes[face]
             shares = own.search[:, 4:12].astype(np.float64).reshape(-1, 4)
             mesh.search[face, 4:12] = _turned_planes(shares, transposed, offset, -1.0).reshape(-1, 8)
             mesh.smooth_planes[:4, smooth] = _turned_planes(own.smooth_planes[:4].T, transposed, offset, 1.0).T
             mesh.smooth_planes[4, smooth] = own.smooth_planes[4]
+            mesh.quadrics[slice(*first.quadric[b : b + 2])] = _turned_quadrics(own.quadrics, transposed, offset)
             mesh.clusters[cluster, :3] = product(own.clusters[:, :3], transposed) + offset
             mesh.clusters[cluster, 3:6] = product(own.clusters[:, 3:6], transposed)
             corners = mesh.vertices[vertex]
@@ -186,20 +191,21 @@ class Assembly:
             meets = ((self._bounds[b, 0] < self._bounds[:, 1]) & (self._bounds[:, 0] < self._bounds[b, 1])).all(axis=1)
             done[b] = True
             for other in np.flatnonzero(meets & ~done):
-                begin, beyond = self._first.face[b], self._first.face[other]
+                one, two = sorted((int(b), int(other)))  # the same curves to the last bit, whichever moved
+                begin, beyond = self._first.face[one], self._first.face[two]
                 ends, pairs = crossings(
-                    corners[begin : self._first.face[b + 1]], corners[beyond : self._first.face[other + 1]]
+                    corners[begin : self._first.face[one + 1]], corners[beyond : self._first.face[two + 1]]
                 )
                 if len(ends):
-                    self._curves[int(b), int(other)] = ends, pairs + np.array([begin, beyond])
+                    self._curves[one, two] = ends, pairs + np.array([begin, beyond])
 
     def _with_curves(self) -> MeshTopology:
         """Return the surface with the curves among its creases."""
         base = self._base._replace(low=self._bounds[:, 0].min(axis=0), high=self._bounds[:, 1].max(axis=0))
         if not self._curves:
             return base
-        ends = np.concatenate([ends for ends, _ in self._curves.values()])
-        pairs = np.concatenate([pairs for _, pairs in self._curves.values()])
+        found = [self._curves[pair] for pair in sorted(self._curves)]
+        ends, pairs = (np.concatenate(column) for column in zip(*found, strict=True))
         # what a closed body hides is asked of the first face: an open one hides nothing
         open_last = base.closed[pairs[:, 0]] & ~base.closed[pairs[:, 1]]
         pairs[open_last] = pairs[open_last][:, ::-1]
@@ -264,15 +270,23 @@ class _Firsts(NamedTuple):
     smooth: NDArray[np.int64]
     fold: NDArray[np.int64]
     cluster: NDArray[np.int64]
+    quadric: NDArray[np.int64]
 
     @classmethod
     def of(cls, own: Sequence[MeshTopology]) -> _Firsts:
         """Count the arrays of bodies."""
         counts = [
-            (len(mesh.vertices), len(mesh.faces), mesh.smooth_planes.shape[1], len(mesh.folds), len(mesh.clusters))
+            (
+                len(mesh.vertices),
+                len(mesh.faces),
+                mesh.smooth_planes.shape[1],
+                len(mesh.folds),
+                len(mesh.clusters),
+                len(mesh.quadrics),
+            )
             for mesh in own
         ]
-        return cls(*np.cumsum([(0,) * 5, *counts], axis=0).T)
+        return cls(*np.cumsum([(0,) * 6, *counts], axis=0).T)
 
 
 def _analysed(bodies: Sequence[Body]) -> list[MeshTopology]:
@@ -313,3 +327,14 @@ def _turned_planes(
     """Return planes n · p = d, or with sign −1 functions n · p + d, (f, 4), of a body that was turned and moved."""
     normal = product(planes[:, :3], transposed)
     return np.column_stack([normal, planes[:, 3] + sign * product(normal, offset[:, None])[:, 0]])
+
+
+def _turned_quadrics(
+    quadrics: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return quadrics, (q, 10), of a body that was turned and moved."""
+    square = product(product(transposed.T, quadrics[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]), transposed)
+    own = product(quadrics[:, None, 6:9], transposed)[:, 0]
+    linear = own - product(square, offset[:, None])[..., 0]
+    constant = quadrics[:, 9] - product((linear + own)[:, None], offset[:, None])[:, 0, 0]
+    return np.column_stack([square[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], linear, constant])

@@ -33,10 +33,12 @@ class Surface:
         attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
-        known = getattr(body.mesh, "face_attributes", {})
-        if body.smooth and "normals" in known and "points" in known:
-            attributes |= {name: known[name] for name in ("normals", "points")}
-        return cls(np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes)
+        known = getattr(body.mesh, "metadata", {})
+        if body.smooth and "quadrics" in known:
+            attributes["quadric"] = body.mesh.face_attributes["quadric"]
+        return cls(
+            np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, dict(known)
+        )
 
 
 _CORNER = (math.pi / SEGMENTS) / math.sin(math.pi / SEGMENTS)
@@ -167,8 +169,8 @@ class Body:
         angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, SEGMENTS // 2 + 1)
         ball = _turned(np.cos(angle), np.sin(angle))
         ball.vertices = ball.vertices * half * math.sqrt(4 * math.pi / ball.area)
-        points = half * _unit(ball.triangles / half)
-        return cls._of(_true_surface(ball, points / half**2, points), albedo, name, pose)
+        quadric = [*1 / half**2, 0, 0, 0, 0, 0, 0, -1]
+        return cls._of(_true_surface(ball, np.zeros(len(ball.faces)), [quadric]), albedo, name, pose)
 
     @classmethod
     def cylinder(
@@ -186,9 +188,8 @@ class Body:
         rho, z = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-0.5, -0.5, 0.5, 0.5])
         solid = _turned(radius * _CORNER * rho, height * z)
         ends = np.abs(solid.face_normals[:, 2]) > math.sqrt(0.5)
-        along = np.where(ends[:, None, None], solid.face_normals[:, None], solid.triangles * [1.0, 1.0, 0.0])
-        points = np.where(ends[:, None, None], solid.triangles, solid.triangles / [_CORNER, _CORNER, 1.0])
-        return cls._of(_true_surface(solid, along, points), albedo, name, pose)
+        side = [1, 1, 0, 0, 0, 0, 0, 0, 0, -(radius**2)]
+        return cls._of(_true_surface(solid, np.where(ends, -1, 0), [side]), albedo, name, pose)
 
     @classmethod
     def capsule(
@@ -208,10 +209,11 @@ class Body:
         angle = np.linspace(0.0, 0.5 * math.pi, SEGMENTS // 4 + 1)
         rho, z = radius * _CORNER * np.cos(angle), radius * _CORNER * np.sin(angle) + 0.5 * height
         solid = _turned([*rho[::-1], *rho], [*-z[::-1], *z])
-        middle = solid.triangles * [0.0, 0.0, 1.0]
-        middle = np.clip(middle, -0.5 * height, 0.5 * height)
-        along = solid.triangles - middle
-        return cls._of(_true_surface(solid, along, middle + radius * _unit(along)), albedo, name, pose)
+        centre, side = 0.5 * height, [1, 1, 0, 0, 0, 0, 0, 0, 0, -(radius**2)]
+        balls = [[1, 1, 1, 0, 0, 0, 0, 0, -z, z**2 - radius**2] for z in (centre, -centre)]
+        middle = solid.triangles_center[:, 2]
+        which = np.where(middle > centre, 1, np.where(middle < -centre, 2, 0))
+        return cls._of(_true_surface(solid, which, [side, *balls]), albedo, name, pose)
 
     @classmethod
     def height_field(
@@ -281,12 +283,8 @@ def _turned(radius_m: ArrayLike, z_m: ArrayLike) -> trimesh.Trimesh:
     return trimesh.creation.revolve(np.column_stack([radius_m, z_m]), sections=SEGMENTS)
 
 
-def _true_surface(mesh: trimesh.Trimesh, along: NDArray[np.float64], points: NDArray[np.float64]) -> trimesh.Trimesh:
-    """Give the corners of each face, (f, 3, 3), normals of any length and points of the true surface."""
-    mesh.face_attributes["normals"], mesh.face_attributes["points"] = _unit(along), points
+def _true_surface(mesh: trimesh.Trimesh, which: ArrayLike, quadrics: ArrayLike) -> trimesh.Trimesh:
+    """Say which quadric the faces of a mesh stand for, −1 for none; see :class:`MeshTopology`."""
+    mesh.face_attributes["quadric"] = np.asarray(which, np.int32)
+    mesh.metadata["quadrics"] = np.asarray(quadrics, np.float64)
     return mesh
-
-
-def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return vectors of length 1."""
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))

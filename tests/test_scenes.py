@@ -1,0 +1,229 @@
+"""Scenes of several bodies against dense rays by other code, closed forms, and the renderer of one landmark."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from oracles.analytic_scenes import Array, Solid, pixels
+from scipy.spatial.transform import Rotation
+
+from phasemark import InputFileError, UsageError
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Background, Body, Renderer, Scene, SceneRenderer, capture, preset
+from phasemark.render.direct import HistogramImages, HistogramRenderer
+
+WIDE = preset("pmd-16x16").with_(rows=4, cols=4, half_angle_h_deg=22.5, half_angle_v_deg=22.5)
+
+
+def placed(place: Any = (0, 0, 0), rotation: Any = None) -> Array:
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    if rotation is not None:
+        pose[:3, :3] = rotation
+    return pose
+
+
+def body_of(solid: Solid) -> Body:
+    options: dict[str, Any] = {"albedo": solid.albedo, "pose": placed(solid.place, solid.rotation)}
+    if solid.kind == "box":
+        return Body.box(2 * np.array(solid.size), **options)
+    if solid.kind == "sphere":
+        return Body.sphere(solid.size[0], **options)
+    return Body.capsule(solid.size[0], 2 * solid.size[1], **options)
+
+
+def random_solids(rng: np.random.Generator, n: int) -> list[Solid]:
+    """Bodies on a table top and in the air, some of which stand in others, some touch the top."""
+    solids = [Solid("box", (2.0, 2.0, 0.05), np.eye(3), np.array([2.0, 0.0, -0.05]), 0.4)]
+    while len(solids) < n:
+        size, kind = rng.uniform(0.05, 0.25), str(rng.choice(["box", "sphere", "capsule"]))
+        place = np.array([rng.uniform(0.5, 2.5), rng.uniform(-0.8, 0.8), rng.uniform(0.0, 0.9)])
+        rotation = Rotation.random(random_state=int(rng.integers(1 << 31))).as_matrix()
+        sizes = {"box": rng.uniform(0.3, 1.2, 3) * size, "sphere": (0.7 * size,), "capsule": (0.4 * size, size)}[kind]
+        if kind == "box" and rng.random() < 0.5:
+            rotation, place[2] = np.eye(3), sizes[2]  # stands on the top
+        if rng.random() < 0.3:
+            place = solids[-1].place + rng.normal(0, 0.04, 3)
+        solids.append(Solid(kind, tuple(sizes), rotation, place, rng.uniform(0.2, 0.9)))
+    return solids
+
+
+def errors(solids: list[Solid], camera: Array, sensor: Any, n: int) -> tuple[float, float]:
+    """Largest error of phasors, in the brightest pixel, and of shares."""
+    image = SceneRenderer(Scene(body_of(solid) for solid in solids), sensor).render(camera)
+    half = math.radians(sensor.half_angle_h_deg)
+    phasor, shares = pixels(solids, camera, (sensor.rows, sensor.cols), half, sensor.modulation_hz, n)
+    assert image.shares is not None
+    np.testing.assert_allclose(image.shares.sum(axis=-1), image.coverage, atol=1e-9)
+    return float(np.abs(image.phasor[0] - phasor).max() / np.abs(phasor).max()), float(
+        np.abs(image.shares[0] - shares).max()
+    )
+
+
+# n × n rays of a pixel put an edge wrong by some n^-3/2 of it; edges along rows by up to 1/2n
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_random_scenes_are_what_dense_rays_see(seed):
+    rng = np.random.default_rng(seed)
+    camera = placed((-0.4, 0.1, 0.5), Rotation.from_euler("zyx", [0.13, 0.17, 0.09]).as_matrix())
+    phasor, shares = errors(random_solids(rng, 9), camera, WIDE, 320)
+    assert phasor < 5e-4
+    assert shares < 1e-3
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(20))
+def test_random_scenes_of_2_to_40_bodies_are_what_very_dense_rays_see(seed):
+    rng = np.random.default_rng([7, seed])
+    camera = placed((-0.4, 0.1, 0.5), Rotation.from_euler("zyx", rng.uniform(-0.2, 0.2, 3)).as_matrix())
+    phasor, shares = errors(random_solids(rng, int(rng.integers(2, 41))), camera, WIDE.with_(rows=8, cols=8), 512)
+    assert phasor < 3e-4
+    assert shares < 5e-4
+
+
+@pytest.mark.parametrize("name", sorted(catalog()))
+def test_a_landmark_alone_is_rendered_as_by_its_renderer(name):
+    mesh, sensor = build_mesh(catalog()[name]), preset("pmd-16x16")
+    expected = Renderer(mesh, sensor, albedo=0.8).render(1.0, 0.4)
+    # the lens stands at distance D on the side δ of the landmark and looks at its axis
+    lens = Renderer(mesh, sensor).render(1.0, 0.4).views.lens_in_landmark()[0]
+    rotation = expected.views.landmark2cam()[0][0].T
+    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(placed(lens, rotation))
+    scale = np.abs(expected.phasor).max()
+    np.testing.assert_allclose(image.phasor / scale, expected.phasor / scale, atol=1e-9)
+    np.testing.assert_allclose(image.coverage, expected.coverage, atol=1e-9)
+
+
+@pytest.mark.parametrize("pitch", [0.0, 0.1])
+def test_a_wall_and_a_floor_behind_a_scene_are_those_of_the_renderer(pitch):
+    mesh, sensor = build_mesh(catalog()["cone"]), preset("pmd-16x16").with_(pitch_deg=2.0)
+    behind = Background(wall_m=2.5, floor_m=0.4)
+    expected = Renderer(mesh, sensor, albedo=0.8).render(1.0, 0.4, pitch_rad=pitch, background=behind)
+    camera = placed(expected.views.lens_in_landmark()[0], expected.views.landmark2cam()[0][0].T)
+    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, behind)
+    scale = np.abs(expected.phasor).max()
+    np.testing.assert_allclose(image.phasor / scale, expected.phasor / scale, atol=1e-6)
+    with pytest.raises(UsageError, match=r"through the floor at 0\.01 m"):
+        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, Background(floor_m=0.01))
+    with pytest.raises(UsageError, match=r"through the wall at 0\.9 m"):
+        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, Background(wall_m=0.9))
+
+
+def test_histograms_of_a_scene_are_those_of_the_landmark_and_sum_up():
+    sensor, mesh = preset("vl53l5cx-8x8"), build_mesh(catalog()["cylinder"])
+    expected = HistogramRenderer(mesh, sensor, albedo=0.8).render(1.0, 0.4)
+    assert expected.views is not None
+    camera = placed(expected.views.lens_in_landmark()[0], expected.views.landmark2cam()[0][0].T)
+    image = SceneRenderer(Scene([Body(mesh, 0.8, "landmark")]), sensor).render(camera)
+    assert isinstance(image, HistogramImages)
+    np.testing.assert_allclose(image.expected, expected.expected, rtol=1e-3, atol=1e-3 * expected.expected.max())
+    assert image.bodies == ("landmark",)
+    assert image.shares is not None
+    assert 0 < image.shares.max() <= 1
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=3)
+    assert frames.counts.shape == (1, 3, 8, 8, sensor.histogram.bins)
+
+
+def test_a_room_seen_from_inside_has_no_gap():
+    room = trimesh.creation.box((4.0, 3.0, 2.5))
+    room.invert()
+    cameras = np.array([placed((0.3, 0.2, 0.1), Rotation.from_euler("z", k).as_matrix()) for k in range(6)])
+    image = SceneRenderer(Scene([Body(room, 0.5, "room"), Body.sphere(0.2, pose=placed((1, 0.5, 0)))]), WIDE).render(
+        cameras
+    )
+    np.testing.assert_allclose(image.coverage, 1.0, atol=1e-9)
+    solid = Body(trimesh.creation.box((4.0, 3.0, 2.5)), name="solid")
+    with pytest.raises(UsageError, match="in frame 2 the lens is inside body 'solid'"):
+        SceneRenderer(Scene([solid]), WIDE).render([placed((5, 0, 0)), placed((0, 5, 0)), placed()])
+
+
+def test_moving_bodies_are_rendered_as_where_they_stand():
+    rng = np.random.default_rng(5)
+    bodies = [body_of(solid) for solid in random_solids(rng, 6)]
+    renderer, n = SceneRenderer(Scene(bodies), WIDE), 4
+    cameras = np.repeat(placed((-0.4, 0, 0.4))[None], n, axis=0)
+    moving = np.repeat(renderer.scene.poses[None], n, axis=0)
+    moving[:, 3, :3, 3] += rng.normal(0, 0.2, (n, 3))  # the fourth goes its way, the others stand
+    together = renderer.render(cameras, moving)
+    threads = SceneRenderer(Scene(bodies), WIDE).render(cameras, moving, workers=2)
+    named = renderer.render(cameras, {"body 3": moving[:, 3]})
+    for k in range(n):
+        there = [Body(body.mesh, body.albedo, pose=moving[k, b]) for b, body in enumerate(bodies)]
+        alone = SceneRenderer(Scene(there), WIDE).render(cameras[k])
+        np.testing.assert_array_equal(together.phasor[k], alone.phasor[0])
+        np.testing.assert_array_equal(together.shares[k], alone.shares[0])
+    np.testing.assert_array_equal(together.phasor, threads.phasor)
+    np.testing.assert_array_equal(together.phasor, named.phasor)
+
+
+def test_both_intersectors_see_the_same_scene():
+    scene = Scene(body_of(solid) for solid in random_solids(np.random.default_rng(8), 8))
+    camera = placed((-0.4, 0.1, 0.5))
+    embree = SceneRenderer(scene, WIDE).render(camera)
+    own = SceneRenderer(scene, WIDE, intersector="float64").render(camera)
+    np.testing.assert_allclose(own.phasor, embree.phasor, atol=2e-5 * np.abs(embree.phasor).max())
+
+
+def test_each_face_may_have_its_albedo_and_what_is_open_is_seen_from_both_sides():
+    sensor = preset("pmd-16x16")
+    plane = Body.plane((4, 4)).mesh
+    front = placed((1, 0, 0), Rotation.from_euler("y", 90, degrees=True).as_matrix())
+    back = placed((1, 0, 0), Rotation.from_euler("y", -90, degrees=True).as_matrix())
+    for pose in (front, back):
+        one = SceneRenderer(Scene([Body(plane, 0.5, pose=pose)]), sensor).render(np.eye(4))
+        two = SceneRenderer(Scene([Body(plane, np.array([0.25, 0.75]), pose=pose)]), sensor).render(np.eye(4))
+        # the rays' amplitude is the albedo times cos θ / r², and the diagonal halves the image
+        assert abs(two.intensity.sum() / one.intensity.sum() - 1) < 1e-6
+        assert two.intensity.max() / one.intensity.max() == pytest.approx(1.5, rel=1e-2)
+    assert one.intensity[0, 8, 8] == pytest.approx(0.5, rel=1e-2)
+
+
+def test_a_file_with_materials_becomes_a_scene(tmp_path):
+    loaded = trimesh.Scene()
+    box = trimesh.creation.box((0.2, 0.2, 0.2))
+    box.visual = trimesh.visual.TextureVisuals(
+        material=trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 255, 255, 255])
+    )
+    loaded.add_geometry(box, node_name="white", transform=placed((1, 0, 0)))
+    grey = trimesh.creation.icosphere(radius=0.1)
+    grey.visual.face_colors = [51, 51, 51, 255]
+    scaled = placed((1, 0.5, 0))
+    scaled[:3, :3] *= 2
+    loaded.add_geometry(grey, node_name="grey", transform=scaled)
+    loaded.export(tmp_path / "scene.glb")
+    scene = Scene.read(tmp_path / "scene.glb")
+    assert set(scene.names) == {"white", "grey"}
+    assert scene["white"].albedo == pytest.approx(1.0)
+    assert np.mean(scene["grey"].albedo) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(scene["grey"].mesh.vertices, axis=0) == pytest.approx([0.4] * 3, rel=1e-6)
+    assert scene["grey"].pose[1, 3] == pytest.approx(0.5)
+    with pytest.raises(InputFileError, match="there is no such file"):
+        Scene.read(tmp_path / "none.glb")
+    (tmp_path / "broken.glb").write_bytes(b"glTF of sorts")
+    with pytest.raises(InputFileError, match=r"broken\.glb: cannot be read as a scene"):
+        Scene.read(tmp_path / "broken.glb")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Scene([]), "needs at least one body"),
+        (lambda: Scene([Body.sphere(1, name="a"), Body.sphere(2, name="a")]), "two bodies are named 'a'"),
+        (lambda: Scene(["box"]), "made of Body objects, got str"),
+        (lambda: Body.sphere(-1), "positive numbers of metres"),
+        (lambda: Body.box((1, 2)), "'size_m' must be 3 positive numbers"),
+        (lambda: Body.sphere(1, albedo=1.2), r"'albedo' must be in \[0, 1\], got 1.2"),
+        (lambda: Body(trimesh.creation.box(), np.ones(3)), "one for each of 12 faces"),
+        (lambda: Body.sphere(1, pose=np.full((4, 4), np.nan)), "pose of a body' must be finite"),
+        (lambda: Body.sphere(1, name="x", pose=np.diag([2, 1, 1, 1])), "pose of body 'x'' must be a rotation"),
+        (lambda: Body.height_field([[0, np.nan], [0, 0]], (1, 1)), "'heights_m' must be finite"),
+        (lambda: Scene([Body.sphere(1)]).posed({"y": np.eye(4)}, 1), "no body is named 'y'"),
+        (lambda: Scene([Body.sphere(1)]).posed(np.zeros((3, 3)), 1), "'bodies2world' must have shape"),
+        (lambda: SceneRenderer("scene", WIDE), "'scene' must be a Scene"),
+        (lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).render(np.eye(3)), "'camera2world' must have shape"),
+    ],
+)
+def test_what_is_no_scene_is_refused_in_words(make, message):
+    with pytest.raises(UsageError, match=message):
+        make()
