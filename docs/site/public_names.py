@@ -31,6 +31,8 @@ OF_MODULES = {
     "phasemark.render.figures": ("PAPER_CMAP", "range_figure", "terminal_figure"),
     "phasemark.render.phasor_images": ("wrap_difference_m", "wrap_range_m"),
     "phasemark.render.planar": ("PlanarLandmark", "planar_images"),
+    "phasemark.render.simulators.gymnasium": ("TofObservation",),
+    "phasemark.render.simulators.mujoco": ("TofReading", "TofSensor", "TofTruth"),
     "phasemark.render.view": ("delta_period_rad", "wrap_delta_difference_rad", "wrap_delta_rad"),
 }
 """Public names of modules that are no packages, and that no package lists."""

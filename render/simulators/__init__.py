@@ -1,0 +1,1 @@
+"""Sensors inside simulators: one module a simulator, each needing the extra of its name."""

@@ -1,0 +1,323 @@
+"""Time-of-flight sensor inside a MuJoCo simulation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.direct.capture import capture
+from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.histogram_images import HistogramImages
+from phasemark.render.frames import Frames
+from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.scene.scene_renderer import SceneRenderer
+from phasemark.render.sensor.range_noise import measured_range_std
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.shipped_sensors import preset
+from phasemark.render.simulators.cadence import Cadence
+
+try:
+    import mujoco
+
+    from phasemark.render.simulators.mujoco_scene import body_name, seen_model
+except ImportError:
+    raise UsageError(
+        "sensors in MuJoCo need the package mujoco: pip install -e '.[mujoco]' in the clone of phasemark"
+    ) from None
+
+__all__ = ["TofReading", "TofSensor", "TofTruth"]
+
+_CAMERA_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, 1.0], [-1.0, 0.0, 0.0]])
+"""Forward, left and up in the frame of a MuJoCo camera, as columns: it looks along −z, y is up."""
+_SITE_AXES = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+"""The same of a site: as a MuJoCo rangefinder it looks along z, and y is up."""
+_GROUPS = 6
+_NO_NORMALS = {"normal": None} if "normal:" in mujoco.mj_multiRay.__doc__ else {}
+"""Argument of rays since they can return normals."""
+_Reported = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, eq=False)
+class TofTruth:
+    """Truth behind a frame.
+
+    Parameters
+    ----------
+    z_m : (rows, cols) float64
+        Distance along the sensor's axis at the centre ray of each zone, of MuJoCo's own geometry; NaN where it meets
+        nothing.
+    shares : (rows, cols, b) float64
+        Share of each zone that each MuJoCo body fills.
+    bodies : tuple of str
+        Names of these bodies.
+    """
+
+    z_m: NDArray[np.float64]
+    shares: NDArray[np.float64]
+    bodies: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class TofReading:
+    """One frame as the sensor reports it.
+
+    Parameters
+    ----------
+    time_s : float
+        Simulated time of the scene that it shows.
+    number : int
+        Of the frame, counted from the start or reset.
+    distance_m : (rows, cols) float64
+        The nearest target: along the ray, or along the axis where ``sensor.quantity`` is "z"; NaN where there is none.
+    status : (rows, cols) uint8
+        0 where the distance is valid; otherwise :class:`~phasemark.render.direct.Status` of a direct sensor,
+        :class:`~phasemark.render.Flag` of a phase camera.
+    sigma_m : (rows, cols) float64
+        Standard deviation of the distance as the sensor estimates it.
+    signal : (rows, cols) float64
+        Counts above ambient light, or electrons of amplitude. A direct sensor without a [histogram] table gives
+        neither: NaN.
+    frames : HistogramFrames or Frames
+        All that was captured: histograms (``frames.counts``) and all targets of a zone (``frames.targets``), or
+        ranges, amplitudes and flags.
+    truth : TofTruth
+    """
+
+    time_s: float
+    number: int
+    distance_m: NDArray[np.float64]
+    status: NDArray[np.uint8]
+    sigma_m: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    frames: HistogramFrames | Frames
+    truth: TofTruth
+
+    @property
+    def histogram(self) -> NDArray[np.float64] | None:
+        """Photon counts, (rows, cols, bins); None for a sensor without histograms."""
+        return self.frames.counts[0, 0] if isinstance(self.frames, HistogramFrames) else None
+
+
+class TofSensor:
+    """Time-of-flight sensor on a camera or site of a MuJoCo model.
+
+    Shapes, sizes and colours are read here, poses with every :meth:`read`: after a change of the model's geoms make
+    another. Planes are seen from both sides; an infinite one is a square of 2 km about the sensor. A geom with alpha 0
+    is invisible, others are opaque. Textures, lights, flexes and skins are not modelled.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    camera, site : str or int
+        Where the sensor is, one of the two, by name or number. It looks as MuJoCo's camera along −z with y up, or as a
+        rangefinder along the z axis of the site, with y up and x to the left. The sensor has its own field of view:
+        the camera's is not used.
+    sensor : str or Sensor
+        Name of a preset, or a sensor.
+    albedo : "rgba", float, or mapping from names of geoms to float
+        Luminance (Rec. 709) of each geom's or its material's colour, one albedo for all, or that of some geoms and the
+        luminance for the others.
+    exclude_body : str or int, optional
+        Body whose own geoms are left out, as the housing of the sensor.
+    groups : sequence of int
+        Groups of geoms that the sensor sees: those that MuJoCo's viewer shows.
+    smooth : bool
+        Whether normals are interpolated between faces of meshes and height fields that meet at less than 30°, as on
+        surfaces that are curved in truth; False: every facet is flat, as for MuJoCo's rays, which takes longer.
+    rate_hz : float, optional
+        Frames per second of simulated time; None: ``frame_rate_hz`` of the sensor.
+    latency_frames : int
+        Frames between exposure and report; 0: none.
+    seed : int
+        Of the noise: the same readings for the same seed and states.
+
+    Raises
+    ------
+    UsageError
+        There is no camera, site, body or preset of a name, both or neither of camera and site are given, a geom is of a
+        type that cannot be rendered, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        camera: str | int | None = None,
+        site: str | int | None = None,
+        sensor: str | Sensor = "vl53l8cx-8x8",
+        albedo: str | float | Mapping[str, float] = "rgba",
+        exclude_body: str | int | None = None,
+        groups: Sequence[int] = (0, 1, 2),
+        smooth: bool = True,
+        rate_hz: float | None = None,
+        latency_frames: int = 1,
+        seed: int = 0,
+    ) -> None:
+        if not isinstance(model, mujoco.MjModel):
+            raise UsageError(f"'model' must be a mujoco.MjModel, got {type(model).__name__}")
+        if (camera is None) == (site is None):
+            raise UsageError("a sensor is on a camera or on a site: give camera=… or site=…, and not both")
+        if not set(groups) <= set(range(_GROUPS)):
+            raise UsageError(f"'groups' must be numbers from 0 to {_GROUPS - 1}, got {tuple(groups)}")
+        self.model = model
+        self.sensor = sensor if isinstance(sensor, Sensor) else preset(sensor)
+        self._site = None if site is None else _number(model, "site", site)
+        self._camera = None if camera is None else _number(model, "camera", camera)
+        self._exclude = -1 if exclude_body is None else _number(model, "body", exclude_body)
+        self._groups = np.isin(np.arange(_GROUPS), groups).astype(np.uint8)
+        self.seen = seen_model(model, albedo, self._exclude, groups, smooth)
+        self.renderer = SceneRenderer(self.seen.scene, self.sensor)
+        bodies = np.unique(self.seen.owner)
+        self._of_body = (self.seen.owner[:, None] == bodies).astype(np.float64)
+        self.bodies = tuple(body_name(model, int(b)) for b in bodies)
+        self._rays = self.sensor.pixel_directions().reshape(-1, 3)
+        self._cadence = Cadence(self.sensor.frame_rate_hz if rate_hz is None else rate_hz, latency_frames)
+        self._seed, self._run = seed, -1
+        self._kept: dict[int, TofReading] = {}
+
+    def __repr__(self) -> str:
+        """Describe in one line the sensor, the scene and the rate."""
+        return f"TofSensor({self.sensor!r}, {self.seen.scene!r}, {self._cadence.rate_hz:g} Hz)"
+
+    def reset(self, seed: int | None = None) -> None:
+        """Start again with the next reading, with other noise, or with that of a seed.
+
+        Parameters
+        ----------
+        seed : int, optional
+        """
+        self._cadence.restart()
+        if seed is not None:
+            self._seed, self._run = seed, -1
+
+    def read(self, data: mujoco.MjData) -> TofReading:
+        """Return the frame that the sensor finished last.
+
+        Between two frames that is the same one. With the first reading, and where the time went back, the sensor
+        starts: it has looked at the present scene before. Poses are those in `data`; ``mj_step`` leaves those from
+        before its last step there.
+
+        Parameters
+        ----------
+        data : mujoco.MjData
+            Of the sensor's model.
+
+        Raises
+        ------
+        UsageError
+            The data is of another model, a pose or the time is not finite, no pose has been computed yet, or the lens
+            is inside a body.
+        """
+        if not isinstance(data, mujoco.MjData) or _layout(data.model) != _layout(self.model):
+            raise UsageError("'data' must be a mujoco.MjData of the sensor's model")
+        time_s = float(data.time)
+        if not math.isfinite(time_s):
+            raise UsageError(f"the time of the data is {time_s}")
+        if self._cadence.restarts(time_s):
+            self.reset()
+            self._run += 1
+            self._kept = {}
+        exposed, reported = self._cadence.frames(time_s)
+        if exposed:
+            try:
+                self._kept |= self._expose(data, exposed)
+            except UsageError:
+                self.reset()
+                raise
+            self._kept = {number: kept for number, kept in self._kept.items() if number >= reported}
+        return self._kept[reported]
+
+    def _expose(self, data: mujoco.MjData, numbers: range) -> dict[int, TofReading]:
+        """Take frames of the present scene."""
+        camera2world = self.camera2world(data)
+        poses = self.seen.poses(data, camera2world[:3, 3])
+        wrong = ~np.isfinite(poses).all(axis=(1, 2))
+        if wrong.any():
+            raise UsageError(f"the pose of body '{self.seen.scene.names[int(wrong.argmax())]}' is not finite")
+        try:
+            images = self.renderer.render(camera2world, poses)
+        except UsageError as error:
+            raise UsageError(f"{str(error).removeprefix('in frame 0 ')}; exclude_body=… leaves one out") from None
+        assert images.shares is not None
+        shares = images.shares[0] @ self._of_body
+        truth = TofTruth(self._centre_z(data, camera2world), shares, self.bodies)
+        return {number: self._reading(images, float(data.time), number, truth) for number in numbers}
+
+    def _reading(
+        self, images: PhasorImages | HistogramImages, time_s: float, number: int, truth: TofTruth
+    ) -> TofReading:
+        """Take one frame; its noise depends on the seed and the numbers of run and frame alone."""
+        frames: HistogramFrames | Frames = capture(
+            images,
+            self.sensor,
+            rng=np.random.default_rng(self._seed),
+            first_view=self._run,
+            first_frame=number,
+        )
+        of_frame = _targets(frames) if isinstance(frames, HistogramFrames) else _ranges(frames)
+        return TofReading(time_s, number, *of_frame, frames, truth)
+
+    def camera2world(self, data: mujoco.MjData) -> NDArray[np.float64]:
+        """Return the pose of the camera's mount, x forward, y left, z up."""
+        pose = np.eye(4)
+        if self._site is not None:
+            pose[:3, :3] = data.site_xmat[self._site].reshape(3, 3) @ _SITE_AXES
+            pose[:3, 3] = data.site_xpos[self._site]
+        else:
+            pose[:3, :3] = data.cam_xmat[self._camera].reshape(3, 3) @ _CAMERA_AXES
+            pose[:3, 3] = data.cam_xpos[self._camera]
+        if not pose[:3, :3].any():
+            raise UsageError("the data has no poses yet: call mujoco.mj_forward(model, data) before the first reading")
+        if not np.isfinite(pose).all():
+            raise UsageError("the pose of the sensor is not finite")
+        return pose
+
+    def _centre_z(self, data: mujoco.MjData, camera2world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the distance along the axis at the centre of each zone, (rows, cols)."""
+        rays = self._rays @ (camera2world[:3, :3] @ self.sensor.cam2level).T
+        n = len(rays)
+        distance, geom = np.empty(n), np.empty(n, np.int32)
+        mujoco.mj_multiRay(
+            m=self.model, d=data, pnt=camera2world[:3, 3], vec=rays.ravel(), geomgroup=self._groups, flg_static=True,
+            bodyexclude=self._exclude, geomid=geom, dist=distance, nray=n, cutoff=mujoco.mjMAXVAL, **_NO_NORMALS,
+        )  # fmt: skip
+        z = np.where(geom >= 0, distance, np.nan).reshape(self.sensor.rows, self.sensor.cols)
+        return np.asarray(z * self.sensor.axis_cosine())
+
+
+def _layout(model: mujoco.MjModel) -> tuple[int, int, bytes]:
+    """Return counts and names: equal for models whose data has the same places, as of one file compiled twice."""
+    return model.nbody, model.ngeom, model.names
+
+
+def _targets(frames: HistogramFrames) -> _Reported:
+    """Return distance, status, sigma and signal of the nearest target in one frame."""
+    targets = frames.targets
+    nearest = (0, 0, ..., 0)
+    return targets.distance_m[nearest], targets.status[nearest], targets.sigma_m[nearest], targets.signal[nearest]
+
+
+def _ranges(frames: Frames) -> _Reported:
+    """Return the same of a camera without histograms."""
+    distance_m = frames.z_m if frames.sensor.quantity == "z" else frames.range_m
+    sigma = signal = np.full(distance_m.shape, np.nan)
+    if frames.amplitude_e is not None and frames.intensity_e is not None:
+        sigma, signal = measured_range_std(frames.amplitude_e, frames.intensity_e, frames.sensor), frames.amplitude_e
+    return distance_m[0, 0], frames.flags[0, 0], sigma[0, 0], signal[0, 0]
+
+
+def _number(model: mujoco.MjModel, kind: str, which: str | int) -> int:
+    """Return the number of a camera, site or body."""
+    count = {"camera": model.ncam, "site": model.nsite, "body": model.nbody}[kind]
+    names = [getattr(model, kind)(k).name for k in range(count)]
+    if isinstance(which, str) and which in names and which:
+        return names.index(which)
+    if not isinstance(which, str) and 0 <= which < count:
+        return int(which)
+    known = ", ".join(f"'{name}'" if name else str(k) for k, name in enumerate(names)) or "none"
+    raise UsageError(f"the model has no {kind} {which!r}: there are {known}")

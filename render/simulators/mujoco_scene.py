@@ -1,0 +1,247 @@
+"""Geoms of a MuJoCo model as bodies of a scene."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.render.integral.components import component_labels
+from phasemark.render.rigid import product
+from phasemark.render.scene.body import Body
+from phasemark.render.scene.scene import Scene
+
+_GEOM = mujoco.mjtGeom
+_OPEN = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)
+"""Types of geoms that are not united with others of their body: a plane has no inside, terrain is large."""
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+_REACH_M = 1000.0
+"""Half a side of the square that stands for an infinite plane."""
+_STEP_M = 500.0
+"""Steps in which that square follows the camera."""
+_ROUNDED = 2.0**20
+"""Poses are rounded to one part of this, a micrometre: a body at rest, which solvers move by less, stays as it is."""
+
+
+@dataclass(frozen=True)
+class SeenModel:
+    """Scene of a model, and where its bodies stand.
+
+    Parameters
+    ----------
+    scene : Scene
+        Each geom is a body; solids of one MuJoCo body and albedo that overlap are one together.
+    owner : (b,) int64
+        Numbers of the MuJoCo bodies.
+    local : (b, 4, 4) float64
+        Poses of the scene's bodies in the MuJoCo bodies.
+    endless : (b, 2) bool
+        Whether a plane is infinite along its x and y.
+    """
+
+    scene: Scene
+    owner: NDArray[np.int64]
+    local: NDArray[np.float64]
+    endless: NDArray[np.bool_]
+
+    def poses(self, data: Any, lens_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the bodies of the scene stand, (b, 4, 4).
+
+        Parameters
+        ----------
+        data : mujoco.MjData
+        lens_m : (3,) float64
+            Infinite planes are rendered about it.
+        """
+        rotation, offset = data.xmat.reshape(-1, 3, 3)[self.owner], data.xpos[self.owner]
+        poses = self.local.copy()
+        poses[:, :3, :3] = product(rotation, self.local[:, :3, :3])
+        poses[:, :3, 3] = product(rotation, self.local[:, :3, 3:])[..., 0] + offset
+        poses = np.round(poses * _ROUNDED) / _ROUNDED
+        for b in np.flatnonzero(self.endless.any(axis=1)):
+            along = product((lens_m - poses[b, :3, 3])[None], poses[b, :3, :3])[0]
+            step = np.where(self.endless[b], np.round(along[:2] / _STEP_M) * _STEP_M, 0.0)
+            poses[b, :3, 3] += poses[b, :3, 0] * step[0] + poses[b, :3, 1] * step[1]
+        return poses
+
+
+def seen_model(
+    model: Any, albedo: str | float | Mapping[str, float], exclude: int, groups: Sequence[int], smooth: bool
+) -> SeenModel:
+    """Make a scene of the geoms that a sensor sees.
+
+    Parameters
+    ----------
+    model : mujoco.MjModel
+    albedo : "rgba", float, or mapping from names to float
+        As for :class:`~phasemark.render.simulators.mujoco.TofSensor`.
+    exclude : int
+        Number of a body whose geoms are left out, −1 for none.
+    groups : sequence of int
+        Groups of geoms that are seen.
+    smooth : bool
+        As for :class:`~phasemark.render.simulators.mujoco.TofSensor`.
+
+    Raises
+    ------
+    UsageError
+        Nothing is left to be seen, an albedo is out of range or of a name that is not there, or there is a geom, flex
+        or skin of a kind that cannot be rendered.
+    """
+    _refuse_flexible(model, groups)
+    own = _albedos(model, albedo)
+    visible = _rgba(model)[:, 3] > 0
+    seen = np.flatnonzero(visible & np.isin(model.geom_group, groups) & (model.geom_bodyid != exclude))
+    if not seen.size:
+        raise UsageError(
+            f"the model has no geom for the sensor to see: {model.ngeom} geoms, groups {tuple(groups)} are visible"
+        )
+    bodies: list[Body] = []
+    local: list[NDArray[np.float64]] = []
+    first: list[int] = []
+    for geoms in _together(model, seen, own, smooth):
+        body, pose = geoms[0][1], _local(model, geoms[0][0])
+        if len(geoms) > 1:
+            parts = [_moved(shape, _local(model, g)) for g, shape in geoms]
+            whole: Any = trimesh.util.concatenate(parts)
+            body, pose = replace(body, mesh=whole), np.eye(4)
+        g = geoms[0][0]
+        name = body_name(model, int(model.geom_bodyid[g]))
+        if any(other.name == name for other in bodies):
+            name = f"{name}, {geom_name(model, g)}"
+        bodies.append(replace(body, albedo=own[g], name=name))
+        local.append(pose)
+        first.append(g)
+    endless = (model.geom_type[first] == _GEOM.mjGEOM_PLANE)[:, None] & (model.geom_size[first, :2] <= 0)
+    found = SeenModel(Scene(bodies), model.geom_bodyid[first].astype(np.int64), np.array(local), endless)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)  # what never moves stands where it is from the start
+    posed = [replace(body, pose=pose) for body, pose in zip(bodies, found.poses(data, np.zeros(3)), strict=True)]
+    return replace(found, scene=Scene(posed))
+
+
+def _together(
+    model: Any, seen: NDArray[np.int64], albedo: Sequence[float], smooth: bool
+) -> list[list[tuple[int, Body]]]:
+    """Return the geoms with their shapes, those of one list to be united: solids of one body that overlap."""
+    shapes = {g: _shape(model, g, smooth) for g in seen.tolist()}
+    bounds = {g: _moved(shape, _local(model, g)).bounds for g, shape in shapes.items()}
+    solid = [g for g in shapes if model.geom_type[g] not in _OPEN and shapes[g].mesh.is_volume]  # type: ignore[attr-defined]
+    pairs = [
+        (a, b)
+        for a, b in itertools.combinations(solid, 2)
+        if (model.geom_bodyid[a], albedo[a], shapes[a].smooth) == (model.geom_bodyid[b], albedo[b], shapes[b].smooth)
+        and (bounds[a][0] < bounds[b][1]).all()
+        and (bounds[b][0] < bounds[a][1]).all()
+    ]
+    label = component_labels(model.ngeom, np.array(pairs, np.int64).reshape(-1, 2))
+    lists: dict[int, list[tuple[int, Body]]] = {}
+    for g, shape in shapes.items():
+        lists.setdefault(int(label[g]), []).append((g, shape))
+    return list(lists.values())
+
+
+def _moved(shape: Body, pose: NDArray[np.float64]) -> trimesh.Trimesh:
+    """Return the mesh of a shape in the frame of its body."""
+    vertices = trimesh.transform_points(np.asarray(shape.mesh.vertices), pose)
+    return trimesh.Trimesh(vertices, shape.mesh.faces, process=False)
+
+
+def body_name(model: Any, body: int) -> str:
+    """Return the name of a body, or its number in words."""
+    return model.body(body).name or f"body {body}"
+
+
+def geom_name(model: Any, geom: int) -> str:
+    """Return the name of a geom, or its number in words."""
+    return model.geom(geom).name or f"geom {geom}"
+
+
+def _refuse_flexible(model: Any, groups: Sequence[int]) -> None:
+    """Refuse flexes and skins."""
+    for kind, groups_of in (("flex", model.flex_group), ("skin", model.skin_group)):
+        for k in np.flatnonzero(np.isin(groups_of, groups)).tolist():
+            raise UsageError(
+                f"{kind} {k} of the model cannot be rendered, for it bends: put it into a group that is not in"
+                f" groups={tuple(groups)}"
+            )
+
+
+def _rgba(model: Any) -> NDArray[np.float64]:
+    """Return the colour of each geom, (n, 4): its own, or its material's where its own is MuJoCo's default grey."""
+    rgba: NDArray[np.float64] = model.geom_rgba.astype(np.float64)
+    of_material = (model.geom_matid >= 0) & (rgba == [0.5, 0.5, 0.5, 1.0]).all(axis=1)
+    rgba[of_material] = model.mat_rgba[model.geom_matid[of_material]]
+    return rgba
+
+
+def _albedos(model: Any, albedo: str | float | Mapping[str, float]) -> list[float]:
+    """Return the albedo of each geom."""
+    own = np.clip(_rgba(model)[:, :3] @ _LUMINANCE, 0.0, 1.0)
+    if isinstance(albedo, Mapping):
+        names = [model.geom(g).name for g in range(model.ngeom)]
+        for name, value in albedo.items():
+            if not name or name not in names:
+                known = ", ".join([name for name in names if name][:8]) or "none has a name"
+                raise UsageError(f"'albedo' names geom {name!r}, which the model does not have: {known}")
+            own[names.index(name)] = _albedo(value, f"'albedo' of geom '{name}'")
+    elif albedo != "rgba":
+        own[:] = _albedo(albedo, "'albedo'")
+    return [round(float(value), 6) for value in own]
+
+
+def _albedo(value: object, what: str) -> float:
+    """Return an albedo that was given."""
+    if isinstance(value, str) or not isinstance(value, (int, float, np.number)) or not 0 <= value <= 1:
+        raise UsageError(f"{what} must be a number in [0, 1], or 'rgba' for all geoms, got {value!r}")
+    return float(value)
+
+
+def _local(model: Any, geom: int) -> NDArray[np.float64]:
+    """Return the pose of a geom in its body, (4, 4)."""
+    pose, rotation = np.eye(4), np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.geom_quat[geom])
+    pose[:3, :3], pose[:3, 3] = rotation.reshape(3, 3), model.geom_pos[geom]
+    return pose
+
+
+def _shape(model: Any, geom: int, smooth: bool) -> Body:
+    """Return a geom in its own frame."""
+    size, kind, of_data = model.geom_size[geom].tolist(), model.geom_type[geom], int(model.geom_dataid[geom])
+    if kind == _GEOM.mjGEOM_PLANE:
+        return Body.plane([2 * half if half > 0 else 2 * _REACH_M for half in size[:2]])
+    if kind == _GEOM.mjGEOM_HFIELD:
+        x, y, top, base = model.hfield_size[of_data].tolist()
+        rows, cols, first = (int(a[of_data]) for a in (model.hfield_nrow, model.hfield_ncol, model.hfield_adr))
+        heights = model.hfield_data[first : first + rows * cols].reshape(rows, cols).astype(np.float64)
+        return replace(Body.height_field(top * heights, (2 * x, 2 * y), base_m=base), smooth=smooth)
+    if kind == _GEOM.mjGEOM_SPHERE:
+        return Body.sphere(size[0])
+    if kind == _GEOM.mjGEOM_CAPSULE:
+        return Body.capsule(size[0], 2 * size[1])
+    if kind == _GEOM.mjGEOM_ELLIPSOID:
+        return Body.ellipsoid(size)
+    if kind == _GEOM.mjGEOM_CYLINDER:
+        return Body.cylinder(size[0], 2 * size[1])
+    if kind == _GEOM.mjGEOM_BOX:
+        return Body.box([2 * half for half in size])
+    if kind == _GEOM.mjGEOM_MESH:
+        vertex, face = int(model.mesh_vertadr[of_data]), int(model.mesh_faceadr[of_data])
+        vertices = model.mesh_vert[vertex : vertex + int(model.mesh_vertnum[of_data])].astype(np.float64)
+        faces = model.mesh_face[face : face + int(model.mesh_facenum[of_data])]
+        return Body(trimesh.Trimesh(vertices, faces), smooth=smooth)
+    try:
+        known = _GEOM(int(kind)).name
+    except ValueError:
+        known = "unknown"
+    raise UsageError(
+        f"{geom_name(model, geom)} of body '{body_name(model, int(model.geom_bodyid[geom]))}' is of type {int(kind)}"
+        f" ({known}), which cannot be rendered: give it a shape, or put it into a group that is not seen"
+    )
