@@ -51,6 +51,7 @@ class Assembly:
         self._poses = np.array([body.pose for body in bodies])
         self._moving = np.zeros(len(bodies), np.bool_)
         self._still: tuple[NDArray[np.int64], Intersector] | None = None
+        self._of_shapes: dict[int, Intersector] = {}
         self._curves: dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
         self._first = _Firsts.of(self._own)
         self._bounds = np.empty((len(bodies), 2, 3))
@@ -164,17 +165,11 @@ class Assembly:
             own, transposed, offset = self._own[b], self._poses[b, :3, :3].T, self._poses[b, :3, 3]
             vertex, face = slice(*first.vertex[b : b + 2]), slice(*first.face[b : b + 2])
             smooth, cluster = slice(*first.smooth[b : b + 2]), slice(*first.cluster[b : b + 2])
-            mesh.vertices[vertex] = product(own.vertices, transposed) + offset
-            mesh.planes[face] = _turned_planes(own.planes, transposed, offset, 1.0)
-            mesh.corner_normals[face, :9] = product(own.corner_normals[:, :9].reshape(-1, 3), transposed).reshape(-1, 9)
-            mesh.search[face, :4] = mesh.planes[face]
-            shares = own.search[:, 4:12].astype(np.float64).reshape(-1, 4)
-            mesh.search[face, 4:12] = _turned_planes(shares, transposed, offset, -1.0).reshape(-1, 8)
-            mesh.smooth_planes[:4, smooth] = _turned_planes(own.smooth_planes[:4].T, transposed, offset, 1.0).T
-            mesh.smooth_planes[4, smooth] = own.smooth_planes[4]
+            _turn_arrays(
+                own, transposed, offset, mesh.vertices[vertex], mesh.planes[face], mesh.corner_normals[face],
+                mesh.search[face], mesh.smooth_planes[:, smooth], mesh.clusters[cluster],
+            )  # fmt: skip
             mesh.quadrics[slice(*first.quadric[b : b + 2])] = _turned_quadrics(own.quadrics, transposed, offset)
-            mesh.clusters[cluster, :3] = product(own.clusters[:, :3], transposed) + offset
-            mesh.clusters[cluster, 3:6] = product(own.clusters[:, 3:6], transposed)
             corners = mesh.vertices[vertex]
             self._bounds[b] = corners.min(axis=0), corners.max(axis=0)
         self._cross(moved)
@@ -185,19 +180,19 @@ class Assembly:
         """Find the curves along which bodies that moved pass through any other."""
         gone = set(moved.tolist())
         self._curves = {pair: found for pair, found in self._curves.items() if gone.isdisjoint(pair)}
-        corners = self._base.vertices[self._base.faces]
         done = np.zeros(len(self._own), np.bool_)
         for b in moved:
             meets = ((self._bounds[b, 0] < self._bounds[:, 1]) & (self._bounds[:, 0] < self._bounds[b, 1])).all(axis=1)
             done[b] = True
             for other in np.flatnonzero(meets & ~done):
                 one, two = sorted((int(b), int(other)))  # the same curves to the last bit, whichever moved
-                begin, beyond = self._first.face[one], self._first.face[two]
-                ends, pairs = crossings(
-                    corners[begin : self._first.face[one + 1]], corners[beyond : self._first.face[two + 1]]
-                )
+                ends, pairs = crossings(self._corners(one), self._corners(two))
                 if len(ends):
-                    self._curves[one, two] = ends, pairs + np.array([begin, beyond])
+                    self._curves[one, two] = ends, pairs + self._first.face[[one, two]]
+
+    def _corners(self, b: int) -> NDArray[np.float64]:
+        """Return the corners of a body's faces, (f, 3, 3)."""
+        return self._base.vertices[self._base.faces[slice(*self._first.face[b : b + 2])]]
 
     def _with_curves(self) -> MeshTopology:
         """Return the surface with the curves among its creases."""
@@ -218,41 +213,100 @@ class Assembly:
         )
 
     def _intersectors(self) -> Intersector:
-        """Return what finds the first face: of all bodies, or of those that stand still and of those that move."""
-        mesh, moves = self._base, self._moving[self._base.part]
+        """Return what finds the first face: of what stands still, and of each body that moves in its own frame."""
+        mesh = self._base
         if self._still is None:
-            numbers = np.flatnonzero(~moves)
+            numbers = np.flatnonzero(~self._moving[mesh.part])
             self._still = numbers, make_intersector(mesh.vertices.copy(), mesh.faces[numbers], self._kind)
-        if not moves.any():
+        moving = np.flatnonzero(self._moving)
+        if not moving.size:
             return self._still[1]
-        numbers = np.flatnonzero(moves)
-        moving = numbers, make_intersector(mesh.vertices.copy(), mesh.faces[numbers], self._kind)
-        return moving[1] if len(numbers) == len(moves) else _NearestOf(mesh.planes, (self._still, moving))
+        for b in moving:
+            shape = id(self._own[b].vertices)
+            if shape not in self._of_shapes:
+                self._of_shapes[shape] = make_intersector(self._own[b].vertices, self._own[b].faces, self._kind)
+        movers = [
+            _Mover(
+                self._of_shapes[id(self._own[b].vertices)], self._poses[b], np.arange(*self._first.face[b : b + 2]),
+                self._bounds[b].mean(axis=0), 0.5 * float(np.linalg.norm(self._bounds[b, 1] - self._bounds[b, 0])),
+            )
+            for b in moving
+        ]  # fmt: skip
+        return _NearestOf(mesh.planes, *self._still, movers)
+
+
+class _Mover(NamedTuple):
+    """A body that moves: its faces in its own frame, their numbers in the scene, and a ball around it."""
+
+    intersector: Intersector
+    pose: NDArray[np.float64]
+    numbers: NDArray[np.int64]
+    centre: NDArray[np.float64]
+    radius_m: float
 
 
 class _NearestOf:
-    """Finds the first face among several sets of faces."""
+    """Finds the first face among those that stand still and those of bodies that move."""
 
-    def __init__(self, planes: NDArray[np.float64], sets: Sequence[tuple[NDArray[np.int64], Intersector]]) -> None:
-        self._planes, self._sets = planes, sets
+    def __init__(
+        self,
+        planes: NDArray[np.float64],
+        numbers: NDArray[np.int64],
+        still: Intersector,
+        movers: Sequence[_Mover],
+    ) -> None:
+        self._planes, self._numbers, self._still, self._movers = planes, numbers, still, movers
 
     def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """Return the number of the first face met by each ray, −1 where none is."""
-        found, distance = np.full(len(origins), -1, np.int32), np.full(len(origins), np.inf)
-        for numbers, intersector in self._sets:
-            _keep_nearer(
-                self._planes, numbers, intersector.first_face(origins, directions), origins, directions, found, distance
+        n = len(origins)
+        found, distance, rays = np.full(n, -1, np.int32), np.full(n, np.inf), np.arange(n)
+        faces = self._still.first_face(origins, directions)
+        _keep_nearer(self._planes, self._numbers, faces, rays, origins, directions, found, distance)
+        own_origins, own_directions = np.empty_like(origins), np.empty_like(directions)
+        for mover in self._movers:
+            count = _aimed_at(
+                mover.centre, mover.radius_m, mover.pose, origins, directions, rays, own_origins, own_directions
             )
+            if count:
+                faces = mover.intersector.first_face(own_origins[:count], own_directions[:count])
+                _keep_nearer(self._planes, mover.numbers, faces, rays, origins, directions, found, distance)
         return found
 
 
 @njit(cache=True)
-def _keep_nearer(planes, numbers, faces, origins, directions, found, distance):  # type: ignore[no-untyped-def]
-    """Replace faces by those that are nearer along the ray."""
-    for i in range(len(faces)):
-        if faces[i] < 0:
+def _aimed_at(centre, radius_m, pose, origins, directions, rays, own_origins, own_directions):  # type: ignore[no-untyped-def]
+    """Write the rays that meet a ball, in the frame of its body; return how many there are."""
+    count = 0
+    for i in range(len(origins)):
+        along, square, away = 0.0, 0.0, 0.0
+        for k in range(3):
+            to = centre[k] - origins[i, k]
+            along += to * directions[i, k]
+            square += directions[i, k] * directions[i, k]
+            away += to * to
+        beside = away - along * along / square
+        slack = 1.0 + 1e-5  # rays are of single precision
+        if beside > radius_m * radius_m * slack or (along < 0.0 and away > radius_m * radius_m * slack):
             continue
-        f = numbers[faces[i]]
+        for j in range(3):
+            start, turned = 0.0, 0.0
+            for k in range(3):
+                start += pose[k, j] * (origins[i, k] - pose[k, 3])
+                turned += pose[k, j] * directions[i, k]
+            own_origins[count, j], own_directions[count, j] = start, turned
+        rays[count] = i
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def _keep_nearer(planes, numbers, faces, rays, origins, directions, found, distance):  # type: ignore[no-untyped-def]
+    """Replace the faces that some rays met by those that are nearer along them."""
+    for j in range(len(faces)):
+        if faces[j] < 0:
+            continue
+        i, f = rays[j], numbers[faces[j]]
         facing, height = 0.0, planes[f, 3]
         for k in range(3):
             facing += planes[f, k] * directions[i, k]
@@ -260,6 +314,50 @@ def _keep_nearer(planes, numbers, faces, origins, directions, found, distance): 
         t = height / facing if facing != 0.0 else 0.0
         if t < distance[i]:
             found[i], distance[i] = f, t
+
+
+@njit(cache=True)
+def _turn_arrays(own, transposed, offset, vertices, planes, corner_normals, search, smooth, clusters):  # type: ignore[no-untyped-def]
+    """Write the arrays of a body that was turned and moved."""
+    for i in range(len(vertices)):
+        _turn(own.vertices[i], transposed, vertices[i])
+        for k in range(3):
+            vertices[i, k] += offset[k]
+    for f in range(len(planes)):
+        _turn_plane(own.planes[f], transposed, offset, 1.0, planes[f])
+        for k in range(3):
+            _turn(own.corner_normals[f, 3 * k : 3 * k + 3], transposed, corner_normals[f, 3 * k : 3 * k + 3])
+        for k in range(4):
+            search[f, k] = planes[f, k]
+        _turn_plane(own.search[f, 4:8], transposed, offset, -1.0, search[f, 4:8])
+        _turn_plane(own.search[f, 8:12], transposed, offset, -1.0, search[f, 8:12])
+    for i in range(smooth.shape[1]):
+        _turn_plane(own.smooth_planes[:4, i], transposed, offset, 1.0, smooth[:4, i])
+        smooth[4, i] = own.smooth_planes[4, i]
+    for c in range(len(clusters)):
+        _turn(own.clusters[c, :3], transposed, clusters[c, :3])
+        _turn(own.clusters[c, 3:6], transposed, clusters[c, 3:6])
+        for k in range(3):
+            clusters[c, k] += offset[k]
+
+
+@njit(cache=True)
+def _turn(vector, transposed, out):  # type: ignore[no-untyped-def]
+    x, y, z = float(vector[0]), float(vector[1]), float(vector[2])
+    for k in range(3):
+        out[k] = (x * transposed[0, k] + y * transposed[1, k]) + z * transposed[2, k]
+
+
+@njit(cache=True)
+def _turn_plane(plane, transposed, offset, sign, out):  # type: ignore[no-untyped-def]
+    """Turn a plane n · p = d, or with sign −1 a function n · p + d."""
+    x, y, z = float(plane[0]), float(plane[1]), float(plane[2])
+    shift = 0.0
+    for k in range(3):
+        normal = (x * transposed[0, k] + y * transposed[1, k]) + z * transposed[2, k]
+        out[k] = normal
+        shift += normal * offset[k]
+    out[3] = plane[3] + sign * shift
 
 
 class _Firsts(NamedTuple):
@@ -319,14 +417,6 @@ def _from_smooth(clusters: NDArray[np.float64], smooth: int) -> NDArray[np.float
     later = clusters.copy()
     later[:, 11] += smooth
     return later
-
-
-def _turned_planes(
-    planes: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64], sign: float
-) -> NDArray[np.float64]:
-    """Return planes n · p = d, or with sign −1 functions n · p + d, (f, 4), of a body that was turned and moved."""
-    normal = product(planes[:, :3], transposed)
-    return np.column_stack([normal, planes[:, 3] + sign * product(normal, offset[:, None])[:, 0]])
 
 
 def _turned_quadrics(
