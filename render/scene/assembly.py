@@ -186,13 +186,13 @@ class Assembly:
             done[b] = True
             for other in np.flatnonzero(meets & ~done):
                 one, two = sorted((int(b), int(other)))  # the same curves to the last bit, whichever moved
-                ends, pairs = crossings(self._corners(one), self._corners(two))
+                ends, pairs = crossings(self._base.vertices, self._faces(one), self._faces(two))
                 if len(ends):
                     self._curves[one, two] = ends, pairs + self._first.face[[one, two]]
 
-    def _corners(self, b: int) -> NDArray[np.float64]:
-        """Return the corners of a body's faces, (f, 3, 3)."""
-        return self._base.vertices[self._base.faces[slice(*self._first.face[b : b + 2])]]
+    def _faces(self, b: int) -> NDArray[np.int32]:
+        """Return the faces of a body, (f, 3)."""
+        return self._base.faces[slice(*self._first.face[b : b + 2])]
 
     def _with_curves(self) -> MeshTopology:
         """Return the surface with the curves among its creases."""

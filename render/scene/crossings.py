@@ -8,22 +8,27 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+_BLOCK = 32
+"""Faces that are looked at together."""
 _TOUCH = 1e-9
 """Share of the extent up to which a corner that lies beyond a plane only touches it; rounding is less."""
 
 
 def crossings(
-    corners: NDArray[np.float64], others: NDArray[np.float64]
+    vertices: NDArray[np.float64], faces: NDArray[np.int32], others: NDArray[np.int32]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return where triangles of one body pass through those of another.
 
-    Faces that only touch, and faces in one plane, do not cross.
+    Faces that only touch, and faces in one plane, do not cross. Faces that follow one another are looked at together:
+    they are near one another in space.
 
     Parameters
     ----------
-    corners : (f, 3, 3) float64
+    vertices : (v, 3) float64
         Metres.
-    others : (g, 3, 3) float64
+    faces : (f, 3) int32
+    others : (g, 3) int32
+        Of the other body.
 
     Returns
     -------
@@ -32,84 +37,109 @@ def crossings(
     pairs : (k, 2) int64
         Numbers of both faces.
     """
-    nothing = np.empty((0, 2, 3)), np.empty((0, 2), np.int64)
-    low, high = np.maximum(corners.min((0, 1)), others.min((0, 1))), np.minimum(corners.max((0, 1)), others.max((0, 1)))
-    if not (low < high).all():
-        return nothing
-    own, beyond = _within(corners, low, high), _within(others, low, high)
-    if not len(own) or not len(beyond):
-        return nothing
-    # swept along x: a face meets only those that begin before it ends
-    own = own[np.argsort(corners[own, :, 0].min(axis=1), kind="stable")]
-    beyond = beyond[np.argsort(others[beyond, :, 0].min(axis=1), kind="stable")]
-    touch = _TOUCH * float(max(np.abs(corners).max(), np.abs(others).max()))
+    blocks, other_blocks = _block_bounds(vertices, faces), _block_bounds(vertices, others)
+    touch = _TOUCH * float(np.abs(blocks).max())
     room = 64
     while True:
         ends, pairs = np.empty((room, 2, 3)), np.empty((room, 2), np.int64)
-        n = _cross(corners[own], others[beyond], touch, ends, pairs)
+        n = _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs)
         if n <= room:
-            return ends[:n], np.column_stack([own[pairs[:n, 0]], beyond[pairs[:n, 1]]])
+            return ends[:n], pairs[:n]
         room = n
 
 
-def _within(corners: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return which faces reach into a box."""
-    return np.flatnonzero(((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)).all(axis=1))
+@njit(cache=True)
+def _block_bounds(vertices, faces):  # type: ignore[no-untyped-def]
+    """Return lowest and highest coordinates of blocks of faces, (b, 2, 3)."""
+    out = np.empty(((len(faces) + _BLOCK - 1) // _BLOCK, 2, 3))
+    out[:, 0], out[:, 1] = np.inf, -np.inf
+    for f in range(len(faces)):
+        own = out[f // _BLOCK]
+        for i in range(3):
+            for k in range(3):
+                x = vertices[faces[f, i], k]
+                own[0, k], own[1, k] = min(own[0, k], x), max(own[1, k], x)
+    return out
 
 
 @njit(cache=True)
-def _cross(corners, others, touch, ends, pairs):  # type: ignore[no-untyped-def]
-    """Write the segments along which triangles cross; return how many there are, also beyond the room for them.
-
-    Both lists are sorted by their lowest x.
-    """
-    count, first = 0, 0
-    widest = 0.0
-    for g in range(len(others)):
-        reach = max(others[g, 0, 0], others[g, 1, 0], others[g, 2, 0])
-        widest = max(widest, reach - min(others[g, 0, 0], others[g, 1, 0], others[g, 2, 0]))
-    inside, beyond = np.empty((2, 3)), np.empty((2, 3))
-    for f in range(len(corners)):
-        a = corners[f]
-        low, high = min(a[0, 0], a[1, 0], a[2, 0]), max(a[0, 0], a[1, 0], a[2, 0])
-        while first < len(others) and min(others[first, 0, 0], others[first, 1, 0], others[first, 2, 0]) < low - widest:
-            first += 1
-        for g in range(first, len(others)):
-            b = others[g]
-            if min(b[0, 0], b[1, 0], b[2, 0]) > high:
-                break
-            apart = False
-            for k in range(3):
-                apart = apart or max(a[0, k], a[1, k], a[2, k]) < min(b[0, k], b[1, k], b[2, k])
-                apart = apart or max(b[0, k], b[1, k], b[2, k]) < min(a[0, k], a[1, k], a[2, k])
-            if apart or not _through(a, b, touch, inside) or not _through(b, a, touch, beyond):
-                continue
-            # both segments lie on the line in which the planes meet
-            dx, dy, dz = inside[1, 0] - inside[0, 0], inside[1, 1] - inside[0, 1], inside[1, 2] - inside[0, 2]
-            square = dx * dx + dy * dy + dz * dz
-            if square <= touch * touch:
-                continue
-            at = np.empty(2)
-            for i in range(2):
-                at[i] = (
-                    dx * (beyond[i, 0] - inside[0, 0])
-                    + dy * (beyond[i, 1] - inside[0, 1])
-                    + dz * (beyond[i, 2] - inside[0, 2])
-                ) / square
-            begin, end = max(min(at[0], at[1]), 0.0), min(max(at[0], at[1]), 1.0)
-            if (end - begin) * math.sqrt(square) <= touch:
-                continue
-            if count < len(ends):
-                for k in range(3):
-                    along = inside[1, k] - inside[0, k]
-                    ends[count, 0, k], ends[count, 1, k] = inside[0, k] + begin * along, inside[0, k] + end * along
-                pairs[count, 0], pairs[count, 1] = f, g
+def _reaching(vertices, faces, block, bounds, found):  # type: ignore[no-untyped-def]
+    """Write the faces of a block that reach into bounds (2, 3); return how many there are."""
+    count = 0
+    for f in range(block * _BLOCK, min((block + 1) * _BLOCK, len(faces))):
+        apart = False
+        for k in range(3):
+            a, b, c = vertices[faces[f, 0], k], vertices[faces[f, 1], k], vertices[faces[f, 2], k]
+            apart = apart or max(a, b, c) < bounds[0, k] or min(a, b, c) > bounds[1, k]
+        if not apart:
+            found[count] = f
             count += 1
     return count
 
 
 @njit(cache=True)
-def _through(a, b, touch, ends):  # type: ignore[no-untyped-def]
+def _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs):  # type: ignore[no-untyped-def]
+    """Write the segments along which triangles cross; return how many there are, also beyond the room for them."""
+    count = 0
+    inside, beyond, height, at = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty(2)
+    own, other = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64)
+    a, b = np.empty((3, 3)), np.empty((3, 3))
+    for p in range(len(blocks)):
+        for q in range(len(other_blocks)):
+            apart = False
+            for k in range(3):
+                apart = apart or blocks[p, 1, k] < other_blocks[q, 0, k] or blocks[p, 0, k] > other_blocks[q, 1, k]
+            if apart:
+                continue
+            n, m = (
+                _reaching(vertices, faces, p, other_blocks[q], own),
+                _reaching(vertices, others, q, blocks[p], other),
+            )
+            for i in range(n):
+                for k in range(3):
+                    a[k] = vertices[faces[own[i], k]]
+                for j in range(m):
+                    for k in range(3):
+                        b[k] = vertices[others[other[j], k]]
+                    apart = False
+                    for k in range(3):
+                        apart = apart or max(a[0, k], a[1, k], a[2, k]) < min(b[0, k], b[1, k], b[2, k])
+                        apart = apart or max(b[0, k], b[1, k], b[2, k]) < min(a[0, k], a[1, k], a[2, k])
+                    if apart:
+                        continue
+                    if not _through(a, b, touch, inside, height) or not _through(b, a, touch, beyond, height):
+                        continue
+                    begin, end = _overlap(inside, beyond, touch, at)
+                    if begin >= end:
+                        continue
+                    if count < len(ends):
+                        for k in range(3):
+                            along = inside[1, k] - inside[0, k]
+                            ends[count, 0, k] = inside[0, k] + begin * along
+                            ends[count, 1, k] = inside[0, k] + end * along
+                        pairs[count, 0], pairs[count, 1] = own[i], other[j]
+                    count += 1
+    return count
+
+
+@njit(cache=True)
+def _overlap(inside, beyond, touch, at):  # type: ignore[no-untyped-def]
+    """Return the shares of a segment between which another on the same line covers it; equal where it does not."""
+    square = 0.0
+    at[0] = at[1] = 0.0
+    for k in range(3):
+        along = inside[1, k] - inside[0, k]
+        square += along * along
+        for i in range(2):
+            at[i] += along * (beyond[i, k] - inside[0, k])
+    if square <= touch * touch:
+        return 0.0, 0.0
+    begin, end = max(min(at[0], at[1]) / square, 0.0), min(max(at[0], at[1]) / square, 1.0)
+    return (begin, end) if (end - begin) * math.sqrt(square) > touch else (0.0, 0.0)
+
+
+@njit(cache=True)
+def _through(a, b, touch, ends, height):  # type: ignore[no-untyped-def]
     """Find where triangle `a` passes through the plane of `b`, into `ends` (2, 3); return whether it does."""
     ux, uy, uz = b[1, 0] - b[0, 0], b[1, 1] - b[0, 1], b[1, 2] - b[0, 2]
     vx, vy, vz = b[2, 0] - b[0, 0], b[2, 1] - b[0, 1], b[2, 2] - b[0, 2]
@@ -117,7 +147,6 @@ def _through(a, b, touch, ends):  # type: ignore[no-untyped-def]
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if length == 0.0:
         return False
-    height = np.empty(3)
     above, below = False, False
     for i in range(3):
         height[i] = (nx * (a[i, 0] - b[0, 0]) + ny * (a[i, 1] - b[0, 1]) + nz * (a[i, 2] - b[0, 2])) / length
