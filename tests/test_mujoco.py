@@ -311,9 +311,11 @@ def test_wrong_states_end_in_one_line():
         sensor.read(data)
 
 
-@pytest.mark.parametrize("missing", ["mujoco", "gymnasium"])
-def test_without_the_package_the_extra_is_named(missing, monkeypatch):
-    module = f"phasemark.render.simulators.{missing}"
+@pytest.mark.parametrize(
+    ("missing", "module"), [("mujoco", "mujoco"), ("mujoco", "mujoco_scene"), ("gymnasium", "gymnasium")]
+)
+def test_without_the_package_the_extra_is_named(missing, module, monkeypatch):
+    module = f"phasemark.render.simulators.{module}"
     monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(UsageError, match=rf"need.* the package {missing}: pip install -e '\.\[mujoco\]'"):

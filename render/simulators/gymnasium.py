@@ -8,14 +8,13 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.simulators import NEEDS_GYMNASIUM
 from phasemark.render.simulators.mujoco import TofReading, TofSensor
 
 try:
     import gymnasium
 except ImportError:
-    raise UsageError(
-        "TofObservation needs the package gymnasium: pip install -e '.[mujoco]' in the clone of phasemark"
-    ) from None
+    raise UsageError(NEEDS_GYMNASIUM) from None
 
 __all__ = ["TofObservation"]
 

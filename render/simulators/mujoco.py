@@ -19,16 +19,14 @@ from phasemark.render.scene.scene_renderer import SceneRenderer
 from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.shipped_sensors import preset
+from phasemark.render.simulators import NEEDS_MUJOCO
 from phasemark.render.simulators.cadence import Cadence
+from phasemark.render.simulators.mujoco_scene import body_name, seen_model
 
 try:
     import mujoco
-
-    from phasemark.render.simulators.mujoco_scene import body_name, seen_model
 except ImportError:
-    raise UsageError(
-        "sensors in MuJoCo need the package mujoco: pip install -e '.[mujoco]' in the clone of phasemark"
-    ) from None
+    raise UsageError(NEEDS_MUJOCO) from None
 
 __all__ = ["TofReading", "TofSensor", "TofTruth"]
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import mujoco
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -17,6 +16,12 @@ from phasemark.render.integral.components import component_labels
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body
 from phasemark.render.scene.scene import Scene
+from phasemark.render.simulators import NEEDS_MUJOCO
+
+try:
+    import mujoco
+except ImportError:
+    raise UsageError(NEEDS_MUJOCO) from None
 
 _GEOM = mujoco.mjtGeom
 _OPEN = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)
