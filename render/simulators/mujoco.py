@@ -173,7 +173,7 @@ class TofSensor:
         bodies = np.unique(self.seen.owner)
         self._of_body = (self.seen.owner[:, None] == bodies).astype(np.float64)
         self.bodies = tuple(body_name(model, int(b)) for b in bodies)
-        self._rays = self.sensor.pixel_directions().reshape(-1, 3)
+        self._rays, self._cosine = self.sensor.pixel_directions().reshape(-1, 3), self.sensor.axis_cosine()
         self._cadence = Cadence(self.sensor.frame_rate_hz if rate_hz is None else rate_hz, latency_frames)
         self._seed, self._run = seed, -1
         self._kept: dict[int, TofReading] = {}
@@ -284,8 +284,7 @@ class TofSensor:
             m=self.model, d=data, pnt=camera2world[:3, 3], vec=rays.ravel(), geomgroup=self._groups, flg_static=True,
             bodyexclude=self._exclude, geomid=geom, dist=distance, nray=n, cutoff=mujoco.mjMAXVAL, **_NO_NORMALS,
         )  # fmt: skip
-        z = np.where(geom >= 0, distance, np.nan).reshape(self.sensor.rows, self.sensor.cols)
-        return np.asarray(z * self.sensor.axis_cosine())
+        return np.asarray(np.where(geom >= 0, distance, np.nan).reshape(self._cosine.shape) * self._cosine)
 
 
 def _layout(model: mujoco.MjModel) -> tuple[int, int, bytes]:
