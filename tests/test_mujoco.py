@@ -265,6 +265,7 @@ WRONG = {
     "group": (dict(groups=(7,)), "'groups' must be numbers from 0 to 5"),
     "nothing": (dict(groups=(4,)), "no geom for the sensor to see"),
     "rate": (dict(rate_hz=0), "'rate_hz' must be positive"),
+    "seed": (dict(seed=-1), "'seed' must not be negative"),
     "latency": (dict(latency_frames=-1), "'latency_frames' must be 0, 1"),
 }
 

@@ -175,8 +175,8 @@ class TofSensor:
         self.bodies = tuple(body_name(model, int(b)) for b in bodies)
         self._rays, self._cosine = self.sensor.pixel_directions().reshape(-1, 3), self.sensor.axis_cosine()
         self._cadence = Cadence(self.sensor.frame_rate_hz if rate_hz is None else rate_hz, latency_frames)
-        self._seed, self._run = seed, -1
         self._kept: dict[int, TofReading] = {}
+        self.reset(seed)
 
     def __repr__(self) -> str:
         """Describe in one line the sensor, the scene and the rate."""
@@ -188,9 +188,16 @@ class TofSensor:
         Parameters
         ----------
         seed : int, optional
+
+        Raises
+        ------
+        UsageError
+            The seed is negative.
         """
         self._cadence.restart()
         if seed is not None:
+            if seed < 0:
+                raise UsageError(f"'seed' must not be negative, got {seed!r}")
             self._seed, self._run = seed, -1
 
     def read(self, data: mujoco.MjData) -> TofReading:
