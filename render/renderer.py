@@ -130,6 +130,18 @@ class Renderer:
         other._integral.sensor = sensor
         return other
 
+    def with_albedo(self, albedo: float) -> Renderer:
+        """Return a renderer of the same landmark with another albedo, which shares all that belongs to the mesh.
+
+        Parameters
+        ----------
+        albedo : float
+            In (0, 1].
+        """
+        other = self.seen_by(self.sensor)
+        other.albedo = other._integral.albedo = float(albedo)
+        return other
+
     def render(
         self,
         distance_m: ArrayLike,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -306,8 +305,7 @@ class FrameJob(SceneJob[FramePlan]):
         views, parts, shown = _views(truth), [], []
         for members in _alike(truth):
             class_index, albedo, wall_m, floor_m = (truth[key][members[0]] for key in _KEYS)
-            renderer = copy.copy(renderers[class_index])
-            renderer.albedo = float(albedo)
+            renderer = renderers[class_index].with_albedo(albedo)
             background = _background(wall_m, floor_m, self.plan)
             parts.append(renderer.render_views(views[members], background=background, **options))
             shown.append(members)

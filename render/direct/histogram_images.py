@@ -6,6 +6,7 @@ of the same shape. What it makes of views is the expected count of every bin (PH
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -114,6 +115,18 @@ class HistogramRenderer:
         self._scene = SceneMesh(mesh, intersector=intersector)
         self.grid = footprint_grid(sensor)
         self.axis = range_axis(sensor)
+
+    def with_albedo(self, albedo: float) -> HistogramRenderer:
+        """Return a renderer of the same landmark with another albedo, which shares all that belongs to the mesh.
+
+        Parameters
+        ----------
+        albedo : float
+            In (0, 1].
+        """
+        other = copy.copy(self)
+        other.albedo = float(albedo)
+        return other
 
     def render(
         self,
