@@ -21,11 +21,13 @@ from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.hdf5_reading import check_format, open_hdf5, reading
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.same_file import named_files
-from phasemark.data.frames.build_frames import FrameJob
+from phasemark.data.frames.build_frames import FrameJob, frames_job
+from phasemark.data.frames.scene_frames_job import SceneFramesJob
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.plans.grid_axis import as_count
-from phasemark.data.plans.size import planned_size
+from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
+from phasemark.data.plans.size import AnyPlan, planned_size
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Job, Place, difference, make_shard, pieces
 from phasemark.data.shards.run import produce, refuse_unwritable_output
@@ -37,11 +39,11 @@ SCHEMA_VERSION = 1
 _GOLDEN = (5**0.5 - 1) / 2
 
 
-def job_for(plan: BankPlan | FramePlan) -> BankJob | FrameJob:
+def job_for(plan: AnyPlan) -> BankJob | FrameJob | SceneFramesJob:
     """Return the job that builds what a plan describes, its views checked."""
     if isinstance(plan, BankPlan):
         return BankJob(plan)
-    job = FrameJob(plan)
+    job = frames_job(plan)
     job.check_views()
     return job
 
@@ -50,7 +52,9 @@ def job_of(spec: dict[str, Any]) -> Job:
     """Return the job that :meth:`phasemark.data.shards.build.Job.spec` describes."""
     if spec["kind"] == "part":
         return PartJob(job_of(spec["of"]), spec["part"], spec["parts"])
-    return BankJob(BankPlan(**spec["plan"])) if spec["kind"] == "bank" else FrameJob(FramePlan(**spec["plan"]))
+    if spec["kind"] == "bank":
+        return BankJob(BankPlan(**spec["plan"]))
+    return frames_job((SceneFramesPlan if spec["kind"] == "scenes" else FramePlan)(**spec["plan"]))
 
 
 MOST_PARTS = 1_000_000
@@ -156,7 +160,7 @@ def _name(piece: int, field: int) -> str:
 
 
 def build_part(
-    plan: BankPlan | FramePlan,
+    plan: AnyPlan,
     part: tuple[int, int],
     path: str | os.PathLike[str],
     *,
@@ -171,7 +175,7 @@ def build_part(
 
     Parameters
     ----------
-    plan : BankPlan or FramePlan
+    plan : BankPlan, FramePlan or SceneFramesPlan
         Plan of the bank or frame set.
     part : (i, n)
         Counted from 1.
@@ -314,14 +318,12 @@ class MergeJob:
         return [np.concatenate(values) for values in found]
 
 
-def estimate_build(
-    plan: BankPlan | FramePlan, *, workers: int = 1, trial_seconds: float | None = None
-) -> dict[str, Any]:
+def estimate_build(plan: AnyPlan, *, workers: int = 1, trial_seconds: float | None = None) -> dict[str, Any]:
     """Return how large a bank or frame set would be and about how long it would take, from a small trial.
 
     Parameters
     ----------
-    plan : BankPlan or FramePlan
+    plan : BankPlan, FramePlan or SceneFramesPlan
         Plan of the bank or frame set.
     workers : int
         Processors that will work on it.
@@ -362,11 +364,14 @@ def estimate_build(
     return {**planned, "bytes": planned["bytes"] + header_bytes, "seconds": seconds}
 
 
-def _thinned(plan: BankPlan | FramePlan) -> BankPlan | FramePlan:
+def _thinned(plan: AnyPlan) -> AnyPlan:
     """Return a plan whose images or views are a sample of those of a large plan, and take as long each."""
+    tried_views = 4096
     if isinstance(plan, FramePlan):
-        tried_views = 4096
         return plan.model_copy(update={"views": tried_views})
+    if isinstance(plan, SceneFramesPlan):
+        tried_scenes = max(1, tried_views // plan.scenes.steps)
+        return plan if plan.scenes.list else plan.with_scenes(tried_scenes)
     plan = plan.resolve()
     assert plan.delta_deg is not None
     tried_values = 64

@@ -22,8 +22,7 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.plans.arrays import Array
-from phasemark.data.plans.bank_plan import BankPlan, MeshPlan
-from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.bank_plan import MeshPlan, PlanModel
 from phasemark.data.shards.build import Place
 from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.landmarks import LandmarkSpec, build_mesh, mesh_symmetry
@@ -45,7 +44,7 @@ class Landmark:
     spec: LandmarkSpec | None = None
 
 
-P = TypeVar("P", BankPlan, FramePlan)
+P = TypeVar("P", bound=PlanModel)
 
 
 class SceneJob(ABC, Generic[P]):
@@ -53,12 +52,12 @@ class SceneJob(ABC, Generic[P]):
 
     Parameters
     ----------
-    plan : BankPlan or FramePlan
+    plan : PlanModel
         The resolved plan.
     sensor : Sensor
         The camera, as the file holds it.
-    stored_mesh : callable, optional
-        Returns the mesh of a class, in place of the mesh file that the plan names.
+    landmarks : list of Landmark
+        Whose meshes the file holds.
     """
 
     KIND: ClassVar[str]
@@ -68,10 +67,10 @@ class SceneJob(ABC, Generic[P]):
     """Names of the arrays of an item, in the order in which :meth:`make` returns them."""
     maker = "phasemark.data.partial_outputs:job_of"
 
-    def __init__(self, plan: P, sensor: Sensor, stored_mesh: StoredMesh | None = None) -> None:
+    def __init__(self, plan: P, sensor: Sensor, landmarks: list[Landmark]) -> None:
         self.plan: P = plan
         self.sensor = sensor
-        self.landmarks = read_landmarks(plan.landmarks, plan.meshes, stored_mesh)
+        self.landmarks = landmarks
 
     def spec(self) -> dict[str, Any]:
         """Return a description from which another process makes the same job."""
@@ -161,7 +160,9 @@ def reserve_array(
 ) -> tuple[h5py.Dataset, Place]:
     """Reserve an array along some scales; its place has the bytes of one index of the first `n_outer` dimensions."""
     shape = [len(scales[dim]) for dim in array.dims]
-    dataset, offset = layout.reserve(group, name, shape, array.kind)
+    kind = np.dtype(array.kind)
+    stored = h5py.string_dtype("utf-8", kind.itemsize) if kind.kind == "S" else kind
+    dataset, offset = layout.reserve(group, name, shape, stored)
     attach_scales(dataset, scales, array.dims)
     dataset.attrs["long_name"] = array.long_name
     dataset.attrs["units"] = array.units
@@ -212,7 +213,7 @@ def _doubt_symmetry(part: MeshPlan, mesh: trimesh.Trimesh) -> None:
         )
 
 
-def _doubt_classes(landmarks: Sequence[Landmark]) -> None:
+def _doubt_classes(landmarks: list[Landmark]) -> None:
     """Warn of classes that are the same part."""
     for first, second in itertools.combinations(landmarks, 2):
         if is_same_shape(first.mesh, second.mesh):

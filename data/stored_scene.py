@@ -19,7 +19,7 @@ from phasemark.data.files.hdf5_reading import (
     reading,
     whole_numbers,
 )
-from phasemark.data.plans.bank_plan import ScenePlan
+from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.render import Sensor
 
 
@@ -37,7 +37,7 @@ class StoredScene:
     WHAT: ClassVar[str]
     FORMAT: ClassVar[str]
     SCHEMA_VERSION: ClassVar[int] = 1
-    plan: ScenePlan
+    plan: PlanModel
     classes: tuple[str, ...]
 
     def __init__(self, file: h5py.File, path: Path) -> None:
@@ -47,6 +47,11 @@ class StoredScene:
         check_format(file, path, self.WHAT, self.FORMAT, self.SCHEMA_VERSION)
         self.sensor = Sensor(**json_attribute(file, path, "sensor"))
         self.versions: dict[str, str] = json_attribute(file, path, "versions")
+
+    @classmethod
+    def of_file(cls, file: h5py.File, path: Path) -> Self:
+        """Return the content of an open file, of this class or of one below it."""
+        return cls(file, path)
 
     def __enter__(self) -> Self:
         return self
@@ -150,7 +155,7 @@ def open_scene(kind: type[S], path: str | os.PathLike[str], *, untrusted: bool =
     file = open_hdf5(path, kind.WHAT, untrusted=untrusted)
     try:
         with reading(path):
-            return kind(file, path)
+            return kind.of_file(file, path)
     except BaseException:
         file.close()
         raise

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,15 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError
+from phasemark import InputFileError, UsageError
 from phasemark.data.bank.bank_file import Bank
 from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.files.hdf5_reading import reading
 from phasemark.data.files.provenance import mesh_sha256
-from phasemark.data.frames.build_frames import FrameJob
-from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.frames.build_frames import frames_job
+from phasemark.data.frames.frame_set_file import FrameSet, SceneFrameSet
+from phasemark.data.frames.frames_job import FramesJob
+from phasemark.data.frames.scene_frames_job import SceneFramesJob
 from phasemark.data.plans.arrays import HISTOGRAM_FIELDS
 from phasemark.data.scene_job import SceneJob, StoredMesh
 from phasemark.data.seeds import stream
@@ -30,7 +33,7 @@ TOLERANCE_M = 1e-5
 TOLERANCE = 1e-5
 """The same for phasors, intensities and coverages, of the brightest pixel."""
 _BLOCK_BYTES = 1 << 24
-_MAY_BE_NAN = ("wall", "floor", "target_distance", "target_sigma")
+_MAY_BE_NAN = ("wall", "floor", "target_distance", "target_sigma", "bodies2world")
 _NOISY = ("range", "amplitude", "intensity", "taps", "range_shot", *HISTOGRAM_FIELDS)
 
 
@@ -59,17 +62,23 @@ def verify_bank(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0
     return _verify(Path(path), Bank, BankJob, sample, seed)
 
 
-def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0) -> dict[str, Any]:
+def verify_frames(
+    path: str | os.PathLike[str], *, sample: int = 16, seed: int = 0, generator: str | None = None
+) -> dict[str, Any]:
     """Check a frame set as :func:`verify_bank` checks a bank, with views rendered and captured again.
+
+    A set of scenes names the program that made them. It is run if you name it too; otherwise nothing is made again.
 
     Parameters
     ----------
     path : path-like
         The frame set, with ``FILE.sha256`` beside it.
     sample : int
-        How many random views to make again, with all frames of each.
+        How many random views, or scenes, to make again, with all frames of each.
     seed : int
         Which of them: the same seed takes the same ones.
+    generator : str, optional
+        ``module:function`` of the generator of scenes that made the set.
 
     Returns
     -------
@@ -80,8 +89,14 @@ def verify_frames(path: str | os.PathLike[str], *, sample: int = 16, seed: int =
     ------
     InputFileError
         Naming the first thing that is wrong.
+    UsageError
+        The generator is not that of the set, or its module is not as it was.
     """
-    return _verify(Path(path), FrameSet, FrameJob, sample, seed)
+    with open_scene(FrameSet, path, untrusted=True) as opened:
+        own = opened.plan.scenes.generator if isinstance(opened, SceneFrameSet) else None
+    if generator not in (None, own):
+        raise UsageError(f"{path}: its generator is {own or 'none'}, not '{generator}'")
+    return _verify(Path(path), FrameSet, frames_job, sample if own == generator else 0, seed)
 
 
 def _verify(
@@ -90,20 +105,24 @@ def _verify(
     digest = verify_checksum(path)
     with open_scene(kind, path, untrusted=True) as opened:
         job = job_of(opened.plan, opened.mesh)
-    with h5py.File(path, "r") as file, reading(path):
-        values = _check_values(file, path)
-        if isinstance(job, FrameJob):
-            _check_columns(file, path, job)
-        for landmark in job.landmarks:
-            if mesh_sha256(landmark.mesh) != file[f"meshes/{landmark.name}"].attrs["sha256"]:
-                raise InputFileError(f"{path}: the mesh of '{landmark.name}' is not what its sha256 says")
+    # what a user's generator raises is no damage
+    making = nullcontext() if isinstance(job, SceneFramesJob) else reading(path)
+    with h5py.File(path, "r") as file:
+        with reading(path):
+            values = _check_values(file, path)
+            if isinstance(job, FramesJob):
+                _check_columns(file, path, job)
+            for landmark in job.landmarks:
+                if mesh_sha256(landmark.mesh) != file[f"meshes/{landmark.name}"].attrs["sha256"]:
+                    raise InputFileError(f"{path}: the mesh of '{landmark.name}' is not what its sha256 says")
         slab_of = np.repeat(np.arange(len(job.items)), job.items)
         first = np.cumsum([0, *job.items])
         chosen = stream(seed, "verify", 0).choice(len(slab_of), size=min(sample, len(slab_of)), replace=False)
-        for item in np.sort(chosen):
-            slab = int(slab_of[item])
-            within = int(item - first[slab])
-            _compare(path, int(item), job, job.read(file, slab, within), job.remake(slab, within))
+        with making:
+            for item in np.sort(chosen):
+                slab = int(slab_of[item])
+                within = int(item - first[slab])
+                _compare(path, int(item), job, job.read(file, slab, within), job.remake(slab, within))
     return {
         "path": str(path),
         "sha256": digest,
@@ -121,7 +140,7 @@ def _check_values(file: h5py.File, path: Path) -> int:
         nonlocal count
         if not isinstance(item, h5py.Dataset) or item.dtype.kind != "f":
             return
-        may_be_nan = name.startswith(("range", "frequency_range")) or name in _MAY_BE_NAN
+        may_be_nan = name.startswith(("range", "frequency_range", "label_")) or name in _MAY_BE_NAN
         per_row = max(1, item.nbytes // max(1, len(item)))
         step = max(1, _BLOCK_BYTES // per_row)
         for start in range(0, len(item), step):
@@ -140,7 +159,7 @@ def _check_values(file: h5py.File, path: Path) -> int:
     return count
 
 
-def _check_columns(file: h5py.File, path: Path, job: FrameJob) -> None:
+def _check_columns(file: h5py.File, path: Path, job: FramesJob[Any]) -> None:
     """Refuse columns, truth and splits among them, that are not what the plan draws."""
     for name, expected in job.columns():
         stored = np.asarray(file[name][...])
@@ -169,6 +188,10 @@ def _compare(
                 raise InputFileError(
                     f"{path}: 'flags' of view {item} differ in {share:.1%} of the pixels when made again"
                 )
+            continue
+        if old.dtype.kind == "S":
+            if (old != new).any():
+                raise InputFileError(f"{path}: '{name}' of item {item} is {old[0]}, and {new[0]} when made again")
             continue
         nan_differs = np.isnan(old) != np.isnan(new)
         gap = np.nan_to_num(new.astype(float) - old.astype(float))

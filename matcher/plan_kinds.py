@@ -16,6 +16,7 @@ from phasemark.data.bank.build_bank import BankJob
 from phasemark.data.frames.build_frames import FrameJob
 from phasemark.data.plans.bank_plan import BankPlan, factored_refusal, read_plan
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.inputs.toml_file import read_toml
 from phasemark.matcher.design import DesignPlan, example_design, read_design_plan
 from phasemark.matcher.design.search import Search
@@ -60,6 +61,13 @@ def _read_frames(path: str | os.PathLike[str]) -> FramePlan:
     return plan
 
 
+def _read_scenes(path: str | os.PathLike[str]) -> SceneFramesPlan:
+    """Read the plan of a frame set of scenes, and refuse a camera that is unknown; the generator is not run."""
+    plan = read_plan(path, SceneFramesPlan)
+    plan.build_sensor()
+    return plan
+
+
 def _read_sweep(path: str | os.PathLike[str]) -> SweepPlan:
     """Read the plan of a sweep, and refuse what its banks, cameras and views would be refused for."""
     plan = read_sweep_plan(path).resolve()
@@ -90,6 +98,7 @@ _KINDS = {
     # first, for what might be any of them
     "bank": _Kind(BankPlan, _shipped("phasemark.data.plans", "examples/bank.toml"), _read_bank),
     "frames": _Kind(FramePlan, _shipped("phasemark.data.plans", "examples/frames.toml"), _read_frames),
+    "scenes": _Kind(SceneFramesPlan, _shipped("phasemark.data.plans", "examples/scenes.toml"), _read_scenes),
     "sweep": _Kind(SweepPlan, _shipped("phasemark.matcher.sweep", "plans/paper.toml"), _read_sweep),
     "drive": _Kind(DrivePlan, example_drive, _read_drive),
     "design": _Kind(DesignPlan, example_design, _read_design),
@@ -103,7 +112,7 @@ def plan_example(kind: str) -> str:
 
     Parameters
     ----------
-    kind : {"bank", "frames", "sweep", "drive", "design"}
+    kind : {"bank", "frames", "scenes", "sweep", "drive", "design"}
 
     Returns
     -------
@@ -122,7 +131,7 @@ def plan_schema(kind: str) -> dict[str, Any]:
 
     Parameters
     ----------
-    kind : {"bank", "frames", "sweep", "drive", "design"}
+    kind : {"bank", "frames", "scenes", "sweep", "drive", "design"}
 
     Returns
     -------
@@ -151,7 +160,7 @@ def check_plan(path: str | os.PathLike[str], kind: str | None = None) -> tuple[s
     Returns
     -------
     kind : str
-    plan : BankPlan, FramePlan, SweepPlan, DrivePlan or DesignPlan
+    plan : BankPlan, FramePlan, SceneFramesPlan, SweepPlan, DrivePlan or DesignPlan
         The resolved plan.
 
     Raises

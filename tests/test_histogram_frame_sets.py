@@ -118,7 +118,7 @@ def test_a_file_from_before_histograms_is_read_and_verified_as_it_is(tmp_path: P
         file.attrs["plan"] = json.dumps(plan)
     (tmp_path / "old.h5.sha256").unlink()
     with open_frames(path) as opened:
-        assert opened.plan.histograms is False
+        assert opened.holds_histograms is False
         assert len(opened.frames()) == 8
 
 

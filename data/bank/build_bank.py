@@ -29,7 +29,7 @@ from phasemark.data.plans.arrays import (
 from phasemark.data.plans.bank_plan import BankPlan, factored_refusal
 from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
-from phasemark.data.scene_job import Landmark, SceneJob, StoredMesh, make_scale, reserve_array
+from phasemark.data.scene_job import Landmark, SceneJob, StoredMesh, make_scale, read_landmarks, reserve_array
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.landmarks import LandmarkSpec, build_mesh
@@ -194,7 +194,7 @@ class BankJob(SceneJob[BankPlan]):
     def __init__(self, plan: BankPlan, stored_mesh: StoredMesh | None = None) -> None:
         plan = plan.resolve()
         _refuse_impossible(plan)
-        super().__init__(plan, plan.image_sensor(), stored_mesh)
+        super().__init__(plan, plan.image_sensor(), read_landmarks(plan.landmarks, plan.meshes, stored_mesh))
         self._slabs = list(_slabs(self.plan, self.sensor, self.landmarks))
 
     @property

@@ -15,14 +15,14 @@ from phasemark.data.commands.options import Building
 from phasemark.data.commands.outputs import refuse_input_files
 
 if TYPE_CHECKING:
-    from phasemark.data import BankPlan, FramePlan
+    from phasemark.data.plans.size import AnyPlan
 
 
 NOTED_BYTES = 100_000_000
 """A file of at least this size is announced before it is built, with the time it takes."""
 
 
-def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out: Path, building: Building) -> None:
+def build_or_estimate(build: Callable[..., Any], plan: AnyPlan, out: Path, building: Building) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data.partial_outputs import build_part, parse_part
     from phasemark.data.plans.size import parse_size, planned_size
@@ -52,7 +52,7 @@ def build_or_estimate(build: Callable[..., Any], plan: BankPlan | FramePlan, out
         echo(out)
 
 
-def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
+def _echo_estimate(plan: AnyPlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
     """Print how large a build would be, and about how long it would take if it is not too large to be tried."""
     from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.size import too_many
@@ -70,9 +70,7 @@ def _echo_estimate(plan: BankPlan | FramePlan, size: Mapping[str, int], fits: bo
         echo_facts({**facts, "seconds": about})
 
 
-def _note_large(
-    plan: BankPlan | FramePlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building
-) -> None:
+def _note_large(plan: AnyPlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building) -> None:
     """Refuse a file above the limit; say of a large one how large it is and about how long it takes."""
     from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.size import format_size, refuse_too_many
@@ -83,7 +81,7 @@ def _note_large(
     counts = ", ".join(f"{n} {name}" for name, n in size.items() if name != "bytes")
     described = f"{out}: {counts}, {format_size(n_bytes)}"
     if n_bytes > limit:
-        smaller = "take fewer 'views' or 'frames_per_view'"
+        smaller = "take fewer 'views' or 'frames_per_view', or 'keep' less of scenes"
         if "images" in size:
             smaller = "thin 'distance_m' or 'delta_deg', keep fewer pixels (--region landmark, --binning N)"
         raise UsageError(

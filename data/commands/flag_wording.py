@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 _NAMED_ALIKE = (
-    "amplitude_unit", "board", "content", "flip_h", "force", "free", "moving", "quantity", "resume", "scheduler",
-    "to", "topic", "unit", "valid_status",
+    "amplitude_unit", "board", "content", "flip_h", "force", "free", "generator", "moving", "quantity", "resume",
+    "scheduler", "to", "topic", "unit", "valid_status",
 )  # fmt: skip
 FLAGS = {
     **{name: f"--{name.replace('_', '-')}" for name in _NAMED_ALIKE},
@@ -23,11 +23,23 @@ PHRASES = {
     "layout='full'": "--full, layout = 'full'",
     "pose_times_s(delay_s=…)": "match --delay-ms",
     "leave refuse_programs() out": "give --trust-plan",
+    "leave refuse_generator() out": "give --trust-plan",
     "run_sweep(resume=True)": "'phasemark sweep run --resume'",
     "unverified()": "--no-verify",
 }
 """What messages name that is no parameter of the call, and what the command line has for it."""
-_WITH_VALUES = ("amplitude_unit", "board", "content", "fixed", "free", "quantity", "scheduler", "trusted", "unit")
+_WITH_VALUES = (
+    "amplitude_unit",
+    "board",
+    "content",
+    "fixed",
+    "free",
+    "generator",
+    "quantity",
+    "scheduler",
+    "trusted",
+    "unit",
+)
 """Parameters that messages name with a value; others may stand in what a user wrote (``--mesh n=part.stl``)."""
 _STATED = rf"(?:({'|'.join(FLAGS)})=(?:…|True\b))"
 _VALUED = rf"(?:({'|'.join(_WITH_VALUES)})=(?=\w)|(part)=(?=\d+/))"

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -42,31 +43,58 @@ from phasemark.data.commands.outputs import (
 )
 
 if TYPE_CHECKING:
+    from phasemark.data.plans import SceneFramesPlan
     from phasemark.render import Sensor
 
 ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"]
+Generator = Annotated[str | None, Shown(metavar="MODULE:NAME", help="The program that makes the scenes.")]
 
 
 def frames_build(
-    plan_file: Path, *, out: Out, seed: Seed | None = None, views: Count | None = None, building: Building
+    plan_file: Path,
+    *,
+    out: Out,
+    seed: Seed | None = None,
+    views: Count | None = None,
+    generator: Generator = None,
+    trust_plan: bool = False,
+    building: Building,
 ) -> None:
-    """Build a set of noisy frames with their truth.
+    """Build a set of noisy frames with their truth, of landmarks or of scenes.
 
     Parameters
     ----------
     plan_file
-        A plan (.toml); options override it.
+        A plan (.toml) of kind frames or scenes; options override it.
     out
         The frame set to write; its checksum goes beside it.
     views
-        Number of views.
+        Number of views, or of scenes that a generator makes.
+    trust_plan
+        Run the generator of scenes that the plan itself names.
     """
-    from phasemark.data import FramePlan, build_frames, read_plan
+    from phasemark.data import build_frames
+    from phasemark.data.plans.scene_frames_plan import SceneFramesPlan, read_frames_plan
 
-    plan = read_plan(plan_file, FramePlan)
-    changes = {key: value for key, value in (("seed", seed), ("views", views)) if value is not None}
-    plan = plan.model_copy(update=changes)
+    plan = read_frames_plan(plan_file)
+    plan = plan if seed is None else plan.model_copy(update={"seed": seed})
+    if isinstance(plan, SceneFramesPlan):
+        plan = plan if views is None else plan.with_scenes(views)
+        _allow_generator(plan, generator, trust_plan, plan_file)
+    elif generator is not None:
+        raise UsageError(f"--generator goes with a plan of scenes, and {plan_file} has no table [scenes]")
+    else:
+        plan = plan if views is None else plan.model_copy(update={"views": views})
     build_or_estimate(build_frames, plan, out, building)
+
+
+def _allow_generator(plan: SceneFramesPlan, generator: str | None, trust_plan: bool, plan_file: Path) -> None:
+    """Let the generator of a plan be imported, from this folder too, if it is the one that was named."""
+    from phasemark.data.plans.scene_frames_plan import refuse_generator
+
+    if not trust_plan:
+        refuse_generator(plan, () if generator is None else (generator,), str(plan_file))
+    sys.path.append(str(Path.cwd()))  # where one's own generator lies; an installed program does not look here itself
 
 
 def frames_info(frames: Path, *, as_json: Json = False) -> None:
@@ -81,8 +109,12 @@ def frames_info(frames: Path, *, as_json: Json = False) -> None:
         echo_facts(opened.info(), as_json=as_json)
 
 
-def frames_verify(frames: Path, *, sample: Sample = 16, seed: Seed = 0, as_json: Json = False) -> None:
+def frames_verify(
+    frames: Path, *, sample: Sample = 16, seed: Seed = 0, generator: Generator = None, as_json: Json = False
+) -> None:
     """Check a frame set: checksum, schema, values, and random views rendered and captured again.
+
+    Scenes are made again if you name the program that made them.
 
     Parameters
     ----------
@@ -91,8 +123,10 @@ def frames_verify(frames: Path, *, sample: Sample = 16, seed: Seed = 0, as_json:
     """
     from phasemark.data.verify import verify_frames
 
+    if generator is not None:
+        sys.path.append(str(Path.cwd()))
     with LongWork("verifying"):
-        report = verify_frames(frames, sample=sample, seed=seed)
+        report = verify_frames(frames, sample=sample, seed=seed, generator=generator)
     echo_facts(report, as_json=as_json)
 
 
@@ -276,7 +310,7 @@ def frames_show(
     if is_frame_set(frames):
         with open_frame_set(frames) as opened:
             _refuse_index(index, len(opened))
-            if opened.plan.histograms:
+            if opened.holds_histograms:
                 figure = opened.histograms([index]).plot()
             else:
                 figure = opened.frames([index]).plot(coverage=opened[index]["coverage"])
@@ -293,11 +327,14 @@ def frames_show(
 
 
 def _title(index: int, sample: Mapping[str, Any]) -> str:
-    """Return class and view of a frame of a set."""
+    """Return class and view, or scene and labels, of a frame of a set."""
     from phasemark.render import Views
     from phasemark.render.figures import view_in_words
     from phasemark.render.view import VIEW_FIELDS
 
+    if "sequence" in sample:
+        labels = [f"{key[6:]} {value}" for key, value in sample.items() if key.startswith("label_")]
+        return ", ".join([f"frame {index}: scene {sample['sequence']}, step {sample['step']}", *labels])
     views = Views.broadcast(*(sample[name] for name in VIEW_FIELDS))
     return f"frame {index}: {sample['class_name']}, {view_in_words(views, 0)}"
 

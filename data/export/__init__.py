@@ -18,7 +18,7 @@ from phasemark.data.export.tables import write_csv, write_npz
 from phasemark.data.files.atomic_write import refuse_unwritable, replacing
 from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder
 from phasemark.data.files.same_file import refuse_inputs
-from phasemark.data.frames.frame_set_file import FrameSet
+from phasemark.data.frames.frame_set_file import FrameSet, SceneFrameSet
 from phasemark.data.measured.reading import RangeOrZ
 
 __all__ = ["EXPORTS", "export_frames"]
@@ -37,6 +37,8 @@ EXPORTS: dict[str, tuple[Writer, bool, tuple[RangeOrZ, ...]]] = {
 }
 """For each format: who writes it, whether it is a folder, and which quantities it can hold, the usual one first."""
 
+OF_LANDMARKS = ("bop", "rosbag")
+"""Formats that hold poses of landmarks."""
 CONTENTS: dict[str, tuple[Content, ...]] = {
     "npz": ("range", "targets", "histogram"),
     "csv": ("range", "targets"),
@@ -94,6 +96,9 @@ def export_frames(
     write, is_folder, quantities = EXPORTS[to]
     if quantity is not None and quantity not in quantities:
         raise UsageError(f"quantity=… must be {' or '.join(quantities)} for {to}, got '{quantity}'")
+    if to in OF_LANDMARKS and isinstance(frames, SceneFrameSet):
+        able = [name for name in EXPORTS if name not in OF_LANDMARKS]
+        raise UsageError(f"to=… must be one of {', '.join(able)} for a set of scenes, got '{to}': it holds landmarks")
     if to == "jsonl" and content is None:
         content = "histogram"
     if content is not None and content not in CONTENTS.get(to, _RANGE_ALONE):

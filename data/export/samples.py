@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.frames.frame_set_file import FrameSet, Sample
+from phasemark.data.frames.frame_set_file import FrameSet, Sample, SceneFrameSet
 from phasemark.data.measured.reading import RangeOrZ
 from phasemark.data.plans.frame_plan import TILT
 from phasemark.render import Sensor, Views
@@ -38,8 +38,13 @@ def quantity_m(frames: FrameSet, sample: Sample, quantity: RangeOrZ) -> NDArray[
 
 
 def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
-    """Return the truth of a block in the units of plans, with class, split and view."""
-    columns: dict[str, NDArray[Any]] = {
+    """Return the truth of a block in the units of plans, with class, split and view; of scenes with their labels."""
+    columns: dict[str, NDArray[Any]]
+    if isinstance(frames, SceneFrameSet):
+        columns = {name: sample[name] for name in ("view", "sequence", "step")}
+        columns["split"] = np.array(frames.splits)[sample["split_index"]]
+        return columns | {name: sample[name] for name in frames.truth if name.startswith("label_")}
+    columns = {
         "view": sample["view"],
         "class": np.asarray(sample["class_name"], dtype=str),
         "split": np.array(frames.splits)[sample["split_index"]],

@@ -23,9 +23,9 @@ def write_npz(frames: FrameSet, path: Path, quantity: RangeOrZ, content: str | N
     found: dict[str, list[Any]] = {}
     for start, sample in blocks(frames):
         columns: dict[str, Any] = _range_columns(frames, sample, quantity) if content in (None, "range") else {}
-        if frames.plan.histograms and content in (None, "targets"):
+        if frames.holds_targets and content in (None, "targets"):
             columns |= target_arrays(sample)
-        if frames.plan.histograms and content in (None, "histogram"):
+        if frames.holds_histograms and content in (None, "histogram"):
             columns |= histogram_arrays(frames, sample, start)
         columns |= truth_columns(frames, sample)
         for name, values in columns.items():

@@ -11,6 +11,7 @@ from typing import Any, Literal, overload
 
 import h5py
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
@@ -21,11 +22,17 @@ from phasemark.data.plans.arrays import (
     FRAME_FIELDS,
     FREQUENCY_FIELDS,
     HISTOGRAM_FIELDS,
+    POSE_FIELDS,
+    SEQUENCE,
     TARGET_FIELDS,
     TRUTH,
+    Array,
     dimension_sizes,
+    frame_set_fields,
+    sizes_of_scenes,
 )
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
@@ -80,12 +87,11 @@ class FrameSet(StoredScene):
 
     WHAT = "frame set"
     FORMAT = "phasemark-frames"
-    plan: FramePlan
+    plan: FramePlan | SceneFramesPlan
 
     def __init__(self, file: h5py.File, path: Path) -> None:
         super().__init__(file, path)
-        self.plan = FramePlan(**_with_histograms_stated(json_attribute(file, path, "plan"), self.sensor))
-        self.classes = tuple(self.plan.landmark_names())
+        self._read_plan(json_attribute(file, path, "plan"))
         self.splits = tuple(self.plan.splits)
         sizes = {dim: len(dataset_of(file, dim, path)) for dim in ("frame", "view", "row", "col")}
         sizes = {**dimension_sizes(self.sensor), **sizes}
@@ -95,20 +101,48 @@ class FrameSet(StoredScene):
             raise InputFileError(
                 f"{path}: has {sizes['frame']} frames of {sizes['view']} views, its plan says otherwise"
             )
-        wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
-        wanted += [f"range_{name}" for name in self.plan.variants]
         if len(self.sensor.frequencies_hz) > 1:
             self._check_frequencies(file)
-            wanted += FREQUENCY_FIELDS
-        if self.plan.histograms:
-            wanted += HISTOGRAM_FIELDS
-        self._fields = {name: self._field(file, name, sizes) for name in wanted}
+        self._arrays = self._wanted(file)
+        sizes |= sizes_of_scenes(self.plan) if isinstance(self.plan, SceneFramesPlan) else {}
+        self._fields = {name: self._field(file, name, array, sizes) for name, array in self._arrays.items()}
         self.view_index = frozen(self._whole(file, "view_index", sizes["frame"]))
         if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
             raise InputFileError(f"{path}: 'view_index' names views that are not there")
         self.truth = self._read_truth(file, sizes["view"])
-        for name in self.classes:
-            group_of(file, f"meshes/{name}", path)
+
+    @classmethod
+    def of_file(cls, file: h5py.File, path: Path) -> FrameSet:
+        """Return the frame set of an open file: of landmarks, or of scenes."""
+        if cls is FrameSet and "scenes" in json_attribute(file, path, "plan"):
+            return SceneFrameSet(file, path)
+        return cls(file, path)
+
+    @property
+    def holds_histograms(self) -> bool:
+        """Whether histograms of a direct sensor are stored."""
+        return "histogram" in self._fields
+
+    @property
+    def holds_targets(self) -> bool:
+        """Whether targets of a direct sensor are stored."""
+        return "target_distance" in self._fields
+
+    def _read_plan(self, plan: dict[str, Any]) -> None:
+        """Take the plan, and the names of the classes."""
+        self.plan = FramePlan(**_with_histograms_stated(plan, self.sensor))
+        self.classes = tuple(self.plan.landmark_names())
+
+    def _wanted(self, file: h5py.File) -> dict[str, Array]:
+        """Return the large datasets that the file must have."""
+        assert isinstance(self.plan, FramePlan)
+        wanted = ["range", "flags", "coverage"] + [name for name in ("amplitude", "intensity", "taps") if name in file]
+        wanted += [f"range_{name}" for name in self.plan.variants]
+        if len(self.sensor.frequencies_hz) > 1:
+            wanted += FREQUENCY_FIELDS
+        if self.plan.histograms:
+            wanted += HISTOGRAM_FIELDS
+        return {name: FIELDS[name] for name in wanted}
 
     def _check_frequencies(self, file: h5py.File) -> None:
         """Refuse frames of other frequencies than those of the sensor."""
@@ -119,9 +153,11 @@ class FrameSet(StoredScene):
                 f"{self.path}: 'frequency' must be {in_words(own)} Hz as its sensor has them, got {in_words(found)}"
             )
 
-    def _field(self, file: h5py.File, name: str, sizes: dict[str, int]) -> tuple[tuple[int, ...], np.dtype[Any], int]:
+    def _field(
+        self, file: h5py.File, name: str, array: Array, sizes: dict[str, int]
+    ) -> tuple[tuple[int, ...], np.dtype[Any], int]:
         """Return shape, type and offset of a dataset; the offset is −1 if its values are not in one piece."""
-        dims, kind, _, _ = FIELDS[name]
+        dims, kind, _, _ = array
         dataset = dataset_of(file, name, self.path)
         shape = tuple(sizes[dim] for dim in dims)
         if dataset.shape != shape or dataset.dtype.kind != np.dtype(kind).kind:
@@ -144,14 +180,20 @@ class FrameSet(StoredScene):
         self._column(file, name, n)
         return whole_numbers(file[name], self.path)
 
+    def _numbers(self, file: h5py.File, name: str, key: str, n: int, count: int) -> NDArray[np.int64]:
+        """Return n whole numbers from 0 to `count` − 1."""
+        found = self._whole(file, name, n)
+        if found.min() < 0 or found.max() >= count:
+            raise InputFileError(f"{self.path}: '{key}' has numbers outside 0 … {count - 1}")
+        return found
+
     def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
         truth: dict[str, NDArray[Any]] = {
-            "class_index": self._whole(file, "landmark_class", n),
-            "split_index": self._whole(file, "split", n),
+            "class_index": self._numbers(file, "landmark_class", "class_index", n, len(self.classes)),
+            "split_index": self._numbers(file, "split", "split_index", n, len(self.splits)),
         }
-        for name, count in (("class_index", len(self.classes)), ("split_index", len(self.splits))):
-            if truth[name].min() < 0 or truth[name].max() >= count:
-                raise InputFileError(f"{self.path}: '{name}' has numbers outside 0 … {count - 1}")
+        for name in self.classes:
+            group_of(file, f"meshes/{name}", self.path)
         for name, array in TRUTH.items():
             if name in _TILT and name not in file:
                 truth[_key(name)] = np.zeros(n)
@@ -199,18 +241,21 @@ class FrameSet(StoredScene):
         for name in self._fields:
             sample[_key(name)] = self._checked(name, self._take(name, numbers if name in FRAME_FIELDS else views))
         sample["view"] = views
-        sample["class_name"] = np.array(self.classes, dtype=object)[self.truth["class_index"][views]]
-        for name, values in self.truth.items():
-            sample[name] = values[views]
+        sample |= self._truth_of(views)
         if not one:
             return sample
         return {key: values[0] if values.ndim > 1 else values[:1].tolist()[0] for key, values in sample.items()}
+
+    def _truth_of(self, views: NDArray[np.int64]) -> Sample:
+        """Return the truth of some views."""
+        names = np.array(self.classes, dtype=object)[self.truth["class_index"][views]]
+        return {"class_name": names, **{name: values[views] for name, values in self.truth.items()}}
 
     def _checked(self, name: str, values: NDArray[Any]) -> NDArray[Any]:
         """Refuse values that no run writes, as soon as they are read: other programs would take them for measured."""
         if name == "histogram":
             self._check_histograms(values)
-        if values.dtype.kind != "f" or name in TARGET_FIELDS:
+        if values.dtype.kind != "f" or name in (*TARGET_FIELDS, *POSE_FIELDS) or name.startswith("label_"):
             return values
         if name == "frequency_range":
             periods = np.array([camera.unambiguous_range_m for camera in self.sensor.by_frequency])[:, None, None]
@@ -235,10 +280,10 @@ class FrameSet(StoredScene):
                 f"{self.path}: 'histogram' must have fewer than {histogram.cycles:.4g} counts in a zone, got {most}"
             )
 
-    def _take(self, name: str, numbers: NDArray[np.integer]) -> NDArray[Any]:
+    def _take(self, name: str, numbers: NDArray[np.integer], file: h5py.File | None = None) -> NDArray[Any]:
         """Read some rows of a dataset, in the order asked for."""
         shape, dtype, offset = self._fields[name]
-        file = self._open()
+        file = file or self._open()
         if offset < 0:
             wanted, back = np.unique(numbers, return_inverse=True)
             with reading(self.path):
@@ -285,7 +330,7 @@ class FrameSet(StoredScene):
         UsageError
             The frame set holds no histograms.
         """
-        self._refuse_without_histograms()
+        self._refuse_without("histograms", self.holds_histograms)
         counts = self._numbered("histogram", index)
         return HistogramFrames(counts[:, None], sensor=self.sensor)
 
@@ -297,7 +342,7 @@ class FrameSet(StoredScene):
         UsageError
             The frame set holds no histograms.
         """
-        self._refuse_without_histograms()
+        self._refuse_without("targets", self.holds_targets)
         distance_m, sigma_m, signal, status = (self._numbered(name, index)[:, None] for name in TARGET_FIELDS)
         return Targets(distance_m.astype(float), sigma_m.astype(float), signal.astype(float), status)
 
@@ -314,15 +359,20 @@ class FrameSet(StoredScene):
         UsageError
             The frame set holds no histograms.
         """
-        self._refuse_without_histograms()
+        self._refuse_without("histograms", self.holds_histograms or self.holds_targets)
         assert self.sensor.histogram is not None
         return self.sensor.histogram.reports
 
-    def _refuse_without_histograms(self) -> None:
-        if not self.plan.histograms:
-            no_table = self.sensor.histogram is None
-            why = "its sensor has no [histogram] table" if no_table else "build it without 'histograms = false'"
-            raise UsageError(f"{self.path} holds no histograms: {why}")
+    def _refuse_without(self, what: str, there: bool) -> None:
+        if there:
+            return
+        why = (
+            f"build it with '{what}' in 'keep'"
+            if isinstance(self.plan, SceneFramesPlan)
+            else "build it without 'histograms = false'"
+        )
+        no_table = self.sensor.histogram is None
+        raise UsageError(f"{self.path} holds no {what}: {'its sensor has no [histogram] table' if no_table else why}")
 
     def view(self, number: int) -> Frames:
         """Return all frames of one view, (1, frames_per_view, rows, cols).
@@ -381,10 +431,7 @@ class FrameSet(StoredScene):
     def info(self) -> dict[str, Any]:
         """Return the content of the frame set in plain numbers and text."""
         file = self._open()
-        of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
-        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
-        distance_m = self.truth["distance_m"]
-        histogram = self.sensor.histogram if self.plan.histograms else None
+        histogram = self.sensor.histogram if self.holds_histograms or self.holds_targets else None
         return {
             "path": str(self.path),
             "size_bytes": int(file.id.get_filesize()),
@@ -392,9 +439,7 @@ class FrameSet(StoredScene):
             "frames": len(self),
             "views": self.plan.views,
             "frames_per_view": self.plan.frames_per_view,
-            "views_of_class": dict(zip(self.classes, of_class.tolist(), strict=True)),
-            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
-            "distance_m": [float(distance_m.min()), float(distance_m.max())],
+            **self._truth_info(),
             "fields": list(self._fields),
             "seed": self.plan.seed,
             "sensor": self.plan.sensor,
@@ -404,6 +449,89 @@ class FrameSet(StoredScene):
             "mesh_sha256": self.identity()["mesh_sha256"],
             "versions": self.versions,
         }
+
+    def _truth_info(self) -> dict[str, Any]:
+        """Return a summary of the views in plain numbers and text."""
+        of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
+        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
+        distance_m = self.truth["distance_m"]
+        return {
+            "views_of_class": dict(zip(self.classes, of_class.tolist(), strict=True)),
+            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
+            "distance_m": [float(distance_m.min()), float(distance_m.max())],
+        }
+
+
+class SceneFrameSet(FrameSet):
+    """Noisy frames of scenes with their truth; made by :func:`open_frames`.
+
+    A frame set whose views are the steps of scenes. Samples have ``sequence``, ``step``, ``split_index``, a key
+    ``label_NAME`` for each label and what else is kept: ``shares`` (rows, cols, classes), ``camera2world`` (4, 4),
+    ``bodies2world`` (bodies, 4, 4) and ``class_of_body`` (bodies,), NaN and −1 where there is no body.
+
+    Attributes
+    ----------
+    plan : SceneFramesPlan
+        The resolved plan.
+    classes : tuple of str
+        Classes of bodies, in the order of ``shares``.
+    truth : dict of str to (views,) array
+        ``sequence``, ``step``, ``split_index``, and ``label_NAME`` for each label.
+    """
+
+    plan: SceneFramesPlan
+
+    def _read_plan(self, plan: dict[str, Any]) -> None:
+        self.plan = SceneFramesPlan(**plan)
+        self.classes = tuple(self.plan.scenes.classes)
+
+    def _wanted(self, file: h5py.File) -> dict[str, Array]:
+        return frame_set_fields(self.plan, self.sensor)
+
+    def _read_truth(self, file: h5py.File, n: int) -> dict[str, NDArray[Any]]:
+        counts = {"sequence": self.plan.n_scenes, "step": self.plan.scenes.steps}
+        truth: dict[str, NDArray[Any]] = {name: self._numbers(file, name, name, n, counts[name]) for name in SEQUENCE}
+        truth["split_index"] = self._numbers(file, "split", "split_index", n, len(self.splits))
+        for name in [name for name in self._fields if name.startswith("label_")]:
+            values = self._take(name, np.arange(n), file)
+            del self._fields[name]
+            try:
+                truth[name] = np.char.decode(values, "utf-8") if values.dtype.kind == "S" else values
+            except UnicodeDecodeError:
+                raise InputFileError(f"{self.path}: '{name}' is not UTF-8") from None
+        return {name: frozen(values) for name, values in truth.items()}
+
+    def _truth_of(self, views: NDArray[np.int64]) -> Sample:
+        return {name: values[views] for name, values in self.truth.items()}
+
+    def _truth_info(self) -> dict[str, Any]:
+        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
+        return {
+            "scenes": self.plan.n_scenes,
+            "steps": self.plan.scenes.steps,
+            "generator": self.plan.scenes.generator or f"{len(self.plan.scenes.list)} files",
+            "classes": list(self.classes),
+            "labels": [name.removeprefix("label_") for name in self.truth if name.startswith("label_")],
+            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
+        }
+
+    def identity(self) -> dict[str, Any]:
+        """Return everything that the file's bytes depend on: resolved plan and versions."""
+        return {"plan": json_attribute(self._open(), self.path, "plan"), "versions": self.versions, "mesh_sha256": {}}
+
+    def mesh(self, class_name: str) -> trimesh.Trimesh:
+        """Refuse: a set of scenes holds no meshes."""
+        raise UsageError(f"{self.path}: is of scenes, and holds no mesh of '{class_name}'")
+
+    def __repr__(self) -> str:
+        """Return one line with the content of the frame set, open or closed."""
+        return (
+            f"FrameSet({self.path.name}: {len(self)} frames of {self.plan.n_scenes} scenes of {self.plan.scenes.steps}"
+            f" steps; {', '.join(name for name in self.truth if name.startswith('label_'))}, {self.plan.sensor})"
+        )
+
+    def _repr_html_(self) -> str:
+        return facts_html(f"Frame set {self.path.name}", {**self._truth_info(), "arrays": ", ".join(self._fields)})
 
 
 class FrameSubset:

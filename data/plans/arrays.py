@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.generated_scene import LABEL_BYTES
+from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.render import Sensor
 
 
@@ -69,7 +71,21 @@ VIEW_FIELDS: dict[str, Array] = {
     "range_hard": Array(("view", "row", "col"), "<f4", "m", "range that the centre ray sees, without noise"),
     "range_mixed": Array(("view", "row", "col"), "<f4", "m", "range mixed over the pixel, without noise"),
 }
-FIELDS = {**FRAME_FIELDS, **VIEW_FIELDS}
+_POSE = ("pose_row", "pose_col")
+POSE_FIELDS = ("camera2world", "bodies2world", "class_of_body")
+SCENE_FIELDS: dict[str, Array] = {
+    "shares": Array(("view", "row", "col", "body_class"), "<f4", "1", "share of the pixel that bodies of a class fill"),
+    "camera2world": Array(("view", *_POSE), "<f8", "1", "camera's mount to world, metres; x forward, z up"),
+    "bodies2world": Array(("view", "body", *_POSE), "<f8", "1", "bodies to world, metres; NaN where there is none"),
+    "class_of_body": Array(("view", "body"), "<i2", "1", "number of each body's class, -1 where there is none"),
+}
+"""Of the views of scenes, beside :data:`VIEW_FIELDS` and labels."""
+FIELDS = {**FRAME_FIELDS, **VIEW_FIELDS, **SCENE_FIELDS}
+SEQUENCE = {
+    "sequence": Array(("view",), "<i8", "1", "number of the scene"),
+    "step": Array(("view",), "<i4", "1", "step of the scene"),
+}
+"""True quantities of a view of a scene that its number alone tells."""
 TRUTH = {
     "distance": Array(("view",), "<f8", "m", "horizontal distance from the lens to the landmark's axis"),
     "delta": Array(("view",), "<f8", "degree", "angle from which the landmark is seen"),
@@ -98,15 +114,33 @@ def dimension_sizes(sensor: Sensor) -> dict[str, int]:
     return sizes
 
 
-def frame_set_fields(plan: FramePlan, sensor: Sensor) -> list[str]:
-    """Return the names of the large datasets of a frame set, in their order in the file."""
-    per_frame = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
+def frame_set_fields(plan: FramePlan | SceneFramesPlan, sensor: Sensor) -> dict[str, Array]:
+    """Return the large datasets of a resolved plan's frame set, in their order in the file."""
+    names = ["range", "flags"] if sensor.kind == "direct" else ["range", "amplitude", "intensity", "flags"]
     if len(sensor.frequencies_hz) > 1:
-        per_frame += FREQUENCY_FIELDS
-    if plan.histograms:
-        per_frame += HISTOGRAM_FIELDS
+        names += FREQUENCY_FIELDS
+    if isinstance(plan, FramePlan):
+        names += HISTOGRAM_FIELDS if plan.histograms else ()
+    else:
+        names += ("histogram",) if "histograms" in plan.keep else ()
+        names += TARGET_FIELDS if "targets" in plan.keep else ()
     if plan.keep_taps:
-        per_frame.append("taps")
+        names.append("taps")
     if "shot" in plan.variants:
-        per_frame.append("range_shot")
-    return [*per_frame, "coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in plan.variants)]
+        names.append("range_shot")
+    names += ["coverage", *(f"range_{name}" for name in ("hard", "mixed") if name in plan.variants)]
+    if isinstance(plan, FramePlan):
+        return {name: FIELDS[name] for name in names}
+    names += ("shares",) if "shares" in plan.keep else ()
+    names += POSE_FIELDS if "poses" in plan.keep else ()
+    labels = {f"label_{name}": _label(name, kind) for name, kind in (plan.scenes.labels or {}).items()}
+    return {name: FIELDS[name] for name in names} | labels
+
+
+def _label(name: str, kind: str) -> Array:
+    return Array(("view",), "<f8" if kind == "number" else f"|S{LABEL_BYTES}", "1", f"label '{name}'")
+
+
+def sizes_of_scenes(plan: SceneFramesPlan) -> dict[str, int]:
+    """Return the lengths of those dimensions of a frame set of scenes that its plan decides."""
+    return {"body_class": len(plan.scenes.classes), "body": plan.scenes.bodies, "pose_row": 4, "pose_col": 4}

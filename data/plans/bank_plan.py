@@ -101,7 +101,8 @@ _Grid = Annotated[
 ]
 
 
-def _without_nul(path: str, info: ValidationInfo) -> str:
+def without_nul(path: str, info: ValidationInfo) -> str:
+    """Refuse a name of a file that cannot be one."""
     if "\0" in path:
         raise UsageError(f"'{info.field_name}' must be the name of a file, which holds no NUL, got {path!r}")
     return path
@@ -157,7 +158,7 @@ class MeshPlan(PlanModel):
     """
 
     name: _Name
-    path: Annotated[str, AfterValidator(_without_nul)]
+    path: Annotated[str, AfterValidator(without_nul)]
     unit: Literal["m", "cm", "mm", "inch"] | None = None
     up: Literal["z", "-z", "y", "-y", "x", "-x"] = "z"
     origin: Literal["file", "base", "center"] = "file"
@@ -221,11 +222,7 @@ class ScenePlan(PlanModel, ABC):
         InputFileError
             The sensor file cannot be read.
         """
-        stated = set(self.sensor_overrides) | _YOUNGER_FIELDS
-        if stated >= set(Sensor.model_fields):  # a resolved plan needs no preset and no file
-            return Sensor(**self.sensor_overrides)
-        base = Sensor.from_toml(self.sensor) if _is_file(self.sensor) else preset(self.sensor)
-        return base.with_(**self.sensor_overrides)
+        return sensor_of(self.sensor, self.sensor_overrides)
 
     def resolve_landmarks(self) -> tuple[list[LandmarkSpec], list[MeshPlan]]:
         """Return the landmarks, those of the catalogue spelled out, and those from mesh files.
@@ -465,11 +462,32 @@ def read_plan(path: str | os.PathLike[str], model: type[P]) -> P:
         With one line that names the file, the key, the value and what would be right.
     """
     path = Path(path)
-    table = model.with_named_tables(read_toml(path), path.parent)
+    return plan_of_table(read_toml(path), path, model)
+
+
+def plan_of_table(table: dict[str, Any], path: Path, model: type[P]) -> P:
+    """Return the plan of a TOML file whose content was read; see :func:`read_plan`."""
+    table = model.with_named_tables(table, path.parent)
     try:
         return model(**table).in_folder(path.parent)
     except UsageError as error:
         raise UsageError(f"{path}: {error}") from None
+
+
+def sensor_of(name_or_file: str, overrides: dict[str, Any]) -> Sensor:
+    """Return the sensor of a plan, overrides applied; a resolved plan states all fields, and needs no preset or file.
+
+    Raises
+    ------
+    UsageError
+        The preset is unknown, or a field or its value is wrong.
+    InputFileError
+        The sensor file cannot be read.
+    """
+    if set(overrides) | _YOUNGER_FIELDS >= set(Sensor.model_fields):
+        return Sensor(**overrides)
+    base = Sensor.from_toml(name_or_file) if _is_file(name_or_file) else preset(name_or_file)
+    return base.with_(**overrides)
 
 
 def sensor_in_folder(sensor: str, folder: Path) -> str:

@@ -152,6 +152,38 @@ _FORM = (BeforeValidator(_to_distribution), PlainSerializer(_to_plain), WithJson
 _Spread = Annotated[Distribution, *_FORM]
 _MaybeSpread = Annotated[Distribution | None, *_FORM]
 _Share = Annotated[float, Field(ge=0, le=1)]
+FramesPerView = Annotated[int, Field(ge=1, le=2**31 - 1)]
+Seed = Annotated[int, Field(ge=0, le=2**64 - 1)]
+Splits = dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share]
+
+
+def default_splits() -> Any:
+    """Return the field of a plan that holds the splits."""
+    return Field(default_factory=_DEFAULT_SPLITS.copy, json_schema_extra={"default": {**_DEFAULT_SPLITS}})
+
+
+def check_splits(splits: Mapping[str, float]) -> None:
+    """Refuse shares that do not add up to 1, and more splits than have numbers."""
+    if not splits or abs(sum(splits.values()) - 1) > 1e-9:
+        raise UsageError(f"'splits' must be shares that add up to 1, got {splits}")
+    if len(splits) > MOST_SPLITS:
+        raise UsageError(f"'splits' must be at most {MOST_SPLITS}, got {len(splits)}")
+
+
+def split_of_views(seed: int, splits: Mapping[str, float], start: int, stop: int) -> NDArray[np.int64]:
+    """Return the numbers of the splits of some views."""
+    ends = np.cumsum(list(splits.values()))
+    return np.minimum(np.searchsorted(ends, _uniform(seed, "split", start, stop), side="right"), len(ends) - 1)
+
+
+def _uniform(seed: int, purpose: str, start: int, stop: int) -> NDArray[np.float64]:
+    """Return numbers in (0, 1), one a view: number `start` of a stream, and those that follow."""
+    rng = stream(seed, f"frames.{purpose}", 0)
+    skipped, offset = divmod(start, 4)  # Philox counts blocks of four numbers
+    rng.bit_generator.advance(skipped)  # type: ignore[attr-defined]
+    raw = rng.random(stop - start + offset)[offset:]
+    return np.maximum(raw, 2.0**-54)
+
 
 TILT = ("pitch_deg", "roll_deg")
 """Quantities that a plan of a level camera does not have."""
@@ -226,8 +258,8 @@ class FramePlan(ScenePlan):
     """
 
     views: Annotated[int, Field(ge=1, le=2**32 - 1)]
-    frames_per_view: Annotated[int, Field(ge=1, le=2**31 - 1)] = 1
-    seed: Annotated[int, Field(ge=0, le=2**64 - 1)] = 0
+    frames_per_view: FramesPerView = 1
+    seed: Seed = 0
     distance_m: _Spread = Distribution(uniform=(0.7, 2.1))
     delta_deg: _Spread = Distribution(uniform=(0.0, 360.0))
     bearing_deg: _Spread = Distribution(fixed=0.0)
@@ -242,9 +274,7 @@ class FramePlan(ScenePlan):
     variants: tuple[Variant, ...] = ("hard", "mixed")
     keep_taps: bool = False
     histograms: bool | None = None
-    splits: dict[Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")], _Share] = Field(
-        default_factory=_DEFAULT_SPLITS.copy, json_schema_extra={"default": {**_DEFAULT_SPLITS}}
-    )
+    splits: Splits = default_splits()
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
@@ -266,10 +296,7 @@ class FramePlan(ScenePlan):
                 raise UsageError(f"'{name}' must be within ± {most:g}° throughout, got {_to_plain(spread)}{hint}")
         if self.albedo is not None and not 0 < self.albedo.lowest <= self.albedo.highest <= 1:
             raise UsageError(f"'albedo' must be in (0, 1] throughout, got {_to_plain(self.albedo)}")
-        if not self.splits or abs(sum(self.splits.values()) - 1) > 1e-9:
-            raise UsageError(f"'splits' must be shares that add up to 1, got {self.splits}")
-        if len(self.splits) > MOST_SPLITS:
-            raise UsageError(f"'splits' must be at most {MOST_SPLITS}, got {len(self.splits)}")
+        check_splits(self.splits)
         if len(set(self.variants)) < len(self.variants):
             raise UsageError(f"'variants' must not repeat, got {list(self.variants)}")
         return self
@@ -334,7 +361,7 @@ class FramePlan(ScenePlan):
         stop = self.views if stop is None else stop
         landmarks: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
         truth: dict[str, NDArray[Any]] = {}
-        of_class = self._uniform("class", start, stop) * len(landmarks)
+        of_class = _uniform(self.seed, "class", start, stop) * len(landmarks)
         truth["class_index"] = narrowed(np.minimum(of_class.astype(np.int64), len(landmarks) - 1), "<i2", "classes")
         sobol = self._sobol(start, stop)
         for name in QUANTITIES:
@@ -348,20 +375,10 @@ class FramePlan(ScenePlan):
             elif spread.fixed is not None:
                 truth[name] = np.full(stop - start, spread.fixed)
             else:
-                truth[name] = spread.values(self._uniform(name, start, stop))
-        ends = np.cumsum(list(self.splits.values()))
-        drawn = self._uniform("split", start, stop)
-        split = np.minimum(np.searchsorted(ends, drawn, side="right"), len(ends) - 1)
+                truth[name] = spread.values(_uniform(self.seed, name, start, stop))
+        split = split_of_views(self.seed, self.splits, start, stop)
         truth["split_index"] = narrowed(split, "|u1", "splits")
         return truth
-
-    def _uniform(self, purpose: str, start: int, stop: int) -> NDArray[np.float64]:
-        """Return numbers in (0, 1), one a view: number `start` of a stream, and those that follow."""
-        rng = stream(self.seed, f"frames.{purpose}", 0)
-        skipped, offset = divmod(start, 4)  # Philox counts blocks of four numbers
-        rng.bit_generator.advance(skipped)  # type: ignore[attr-defined]
-        raw = rng.random(stop - start + offset)[offset:]
-        return np.maximum(raw, 2.0**-54)
 
     def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:
         from scipy.stats import qmc  # slow to import

@@ -10,18 +10,21 @@ import numpy as np
 
 from phasemark import UsageError
 from phasemark.data.plans.arrays import (
-    FIELDS,
     LAYOUT_GROUPS,
     VIEW_DIMS,
     bank_frequencies_hz,
     dimension_sizes,
     frame_set_fields,
     group_rows,
+    sizes_of_scenes,
 )
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.frame_plan import FramePlan
+from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.render import Sensor
 
+AnyPlan = BankPlan | FramePlan | SceneFramesPlan
+"""Of what is built in shards."""
 MOST_IMAGES = 20_000_000
 """Of a bank: their views are kept in memory while it is built, 32 bytes each."""
 MOST_VIEWS = 5_000_000
@@ -31,12 +34,12 @@ MOST_FRAMES = 50_000_000
 _UNITS = {"": 1, "B": 1, "kB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 
-def planned_size(plan: BankPlan | FramePlan) -> dict[str, int]:
+def planned_size(plan: AnyPlan) -> dict[str, int]:
     """Return how large a bank or frame set would be, from its plan alone: nothing is rendered, no mesh is read.
 
     Parameters
     ----------
-    plan : BankPlan or FramePlan
+    plan : BankPlan, FramePlan or SceneFramesPlan
         Plan of the bank or frame set.
 
     Returns
@@ -84,12 +87,12 @@ def too_many(counts: Mapping[str, int]) -> str | None:
     return None
 
 
-def refuse_too_many(plan: BankPlan | FramePlan) -> None:
+def refuse_too_many(plan: AnyPlan) -> None:
     """Refuse a plan whose bank or frame set cannot be one file.
 
     Parameters
     ----------
-    plan : BankPlan or FramePlan
+    plan : BankPlan, FramePlan or SceneFramesPlan
 
     Raises
     ------
@@ -122,16 +125,18 @@ def _bank_size(plan: BankPlan, sensor: Sensor) -> dict[str, int]:
     return {"images": images, "bytes": size}
 
 
-def _frames_size(plan: FramePlan, sensor: Sensor) -> dict[str, int]:
+def _frames_size(plan: FramePlan | SceneFramesPlan, sensor: Sensor) -> dict[str, int]:
     counts = {
         "frame": plan.views * plan.frames_per_view, "view": plan.views, **dimension_sizes(sensor),
     }  # fmt: skip
     bytes_of_a_frame = 24  # its number, its view and its seed
     bytes_of_a_view = 67  # its number, class, split and truth
+    if isinstance(plan, SceneFramesPlan):
+        counts |= sizes_of_scenes(plan)
+        bytes_of_a_view = 21  # its number, sequence, step and split
     size = bytes_of_a_frame * counts["frame"] + bytes_of_a_view * counts["view"]
-    for name in frame_set_fields(plan, sensor):
-        dims, kind, _, _ = FIELDS[name]
-        size += math.prod(counts[dim] for dim in dims) * np.dtype(kind).itemsize
+    for array in frame_set_fields(plan, sensor).values():
+        size += math.prod(counts[dim] for dim in array.dims) * np.dtype(array.kind).itemsize
     return {"views": plan.views, "frames": counts["frame"], "bytes": size}
 
 

@@ -13,7 +13,8 @@ from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Json
 
 PlanKind = Annotated[
-    Literal["bank", "frames", "sweep", "drive", "design"], Shown(help="bank, frames, sweep, drive or design.")
+    Literal["bank", "frames", "scenes", "sweep", "drive", "design"],
+    Shown(help="bank, frames, scenes, sweep, drive or design."),
 ]
 
 
@@ -39,7 +40,7 @@ def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = Fals
     file
         A plan (.toml).
     kind
-        bank, frames, sweep, drive or design, if the plan leaves it open.
+        bank, frames, scenes, sweep, drive or design, if the plan leaves it open.
     """
     from phasemark.data.plans.bank_plan import ScenePlan
     from phasemark.matcher.drive import DrivePlan

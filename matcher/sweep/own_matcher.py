@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-import importlib
 import numbers
-import signal
-import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from phasemark import UsageError
+from phasemark.inputs.own_program import called_program, imported_program
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 
 MatchFrames = Callable[[FilteredFrames], Sequence[Match]]
-_TERMINATED = 128 + signal.SIGTERM
-"""The exit status with which the command line ends on SIGTERM: no error of a user's module."""
 
 
 def imported_matcher(text: str) -> MatchFrames:
@@ -29,19 +25,7 @@ def imported_matcher(text: str) -> MatchFrames:
         It cannot be imported: with the reason; if the module's own code failed, its traceback is a note of the error
         (:pep:`678`).
     """
-    module, _, name = text.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (Exception, SystemExit) as error:
-        if isinstance(error, SystemExit) and error.code == _TERMINATED:
-            raise
-        failed = UsageError(f"the matcher '{text}' cannot be imported ({_named(error)})")
-        if own := _own_traceback(error):
-            failed.add_note(own)
-        raise failed from None
-    if not callable(found):
-        raise UsageError(f"the matcher '{text}' must be callable, got {type(found).__name__}")
-    match: MatchFrames = found
+    match: MatchFrames = imported_program(text, "the matcher")
     return match
 
 
@@ -54,9 +38,7 @@ def own_matches(
         found = match(frames)
         matches = list(found) if isinstance(found, Iterable) else None
     except (Exception, SystemExit) as error:
-        failed = UsageError(f"{where}: the matcher '{text}' raised {_named(error)}")
-        failed.add_note(_own_traceback(error) or _named(error))
-        raise failed from None
+        raise called_program(f"the matcher '{text}'", error, where) from None
     if matches is None:
         raise UsageError(f"{due}, got {'None' if found is None else f'an object of type {type(found).__name__}'}")
     for k, one in enumerate(matches):
@@ -88,20 +70,3 @@ def _wrong_field(match: Match, names: Sequence[str]) -> str | None:
         if np.shape(match.covariance) != (n, n):
             return f"'covariance' of shape {np.shape(match.covariance)}: it must be {(n, n)}, as 'free' has {n} names"
     return None
-
-
-def _named(error: BaseException) -> str:
-    """Return type and message of an exception in one line."""
-    return " ".join(f"{type(error).__name__}: {error}".split()).rstrip(":")
-
-
-def _own_traceback(error: BaseException) -> str:
-    """Return the traceback of a user's code, without our calls and those that import it; empty if nothing is left."""
-    own = error.__traceback__
-    while own is not None and _is_ours_or_import(own.tb_frame.f_code.co_filename):
-        own = own.tb_next
-    return "" if own is None else "".join(traceback.format_exception(type(error), error, own)).rstrip()
-
-
-def _is_ours_or_import(filename: str) -> bool:
-    return filename in (__file__, importlib.__file__) or filename.startswith("<frozen importlib")
