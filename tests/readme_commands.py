@@ -328,7 +328,17 @@ def _write_camera_info(path: Path) -> None:
     )
 
 
+def _copy_block(path: Path) -> None:
+    """Write the block of docs/formats.md of the file's language that names its stem."""
+    language = {".py": "python", ".toml": "toml"}[path.suffix]
+    page = (Path(__file__).parent.parent / "docs" / "formats.md").read_text(encoding="utf-8")
+    (text,) = [b.text for b in read_blocks(page) if b.language == language and path.stem in b.text]
+    path.write_text(text, encoding="utf-8")
+
+
 GIVEN: dict[str, Callable[[Path], None]] = {
+    "balls.py": _copy_block,
+    "balls.toml": _copy_block,
     "board_1m.npz": _write_board,
     "board_2m.npz": _write_board,
     "board_3m.npz": _write_board,

@@ -290,7 +290,9 @@ def test_an_existing_folder_needs_force_and_is_replaced_whole(frames, tmp_path):
 
 
 def test_an_unknown_format_is_named(frames, tmp_path):
-    with pytest.raises(UsageError, match="to=… must be one of npz, csv, jsonl, png16, ply, bop, rosbag, got 'gif'"):
+    with pytest.raises(
+        UsageError, match="to=… must be one of npz, csv, jsonl, png16, ply, bop, rosbag, webdataset, lerobot, got 'gif'"
+    ):
         exported(frames, tmp_path, "gif")
 
 

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from phasemark.data.plans import SceneFramesPlan
     from phasemark.render import Sensor
 
-ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"]
+ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag", "webdataset", "lerobot"]
 Generator = Annotated[str | None, Shown(metavar="MODULE:NAME", help="The program that makes the scenes.")]
 
 
@@ -157,7 +157,7 @@ def frames_export(
     frames
         A frame set.
     to
-        npz, csv, jsonl, png16, ply, bop or rosbag.
+        npz, csv, jsonl, png16, ply, bop, rosbag, webdataset or lerobot.
     out
         The file (npz, csv, jsonl) or folder to write.
     quantity

@@ -1,4 +1,4 @@
-"""Frame sets for other programs: npz, 16-bit PNG, CSV, JSON lines, PLY point clouds, BOP, ROS 2 bags."""
+"""Frame sets for other programs: npz, PNG, CSV, JSON lines, point clouds, BOP, ROS 2 bags, WebDataset, LeRobot."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ from phasemark.data.export.bop import write_bop
 from phasemark.data.export.clouds import write_ply
 from phasemark.data.export.histograms import write_jsonl, write_targets_csv
 from phasemark.data.export.images import write_png16
+from phasemark.data.export.lerobot import write_lerobot
 from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_npz
+from phasemark.data.export.webdataset import write_webdataset
 from phasemark.data.files.atomic_write import refuse_unwritable, replacing
 from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder
 from phasemark.data.files.same_file import refuse_inputs
@@ -34,6 +36,8 @@ EXPORTS: dict[str, tuple[Writer, bool, tuple[RangeOrZ, ...]]] = {
     "ply": (write_ply, True, ("range",)),
     "bop": (write_bop, True, ("z",)),
     "rosbag": (write_rosbag, True, ("z",)),
+    "webdataset": (write_webdataset, True, ("range",)),
+    "lerobot": (write_lerobot, True, ("range",)),
 }
 """For each format: who writes it, whether it is a folder, and which quantities it can hold, the usual one first."""
 
@@ -43,8 +47,10 @@ CONTENTS: dict[str, tuple[Content, ...]] = {
     "npz": ("range", "targets", "histogram"),
     "csv": ("range", "targets"),
     "jsonl": ("histogram",),
+    "webdataset": (),
+    "lerobot": (),
 }
-"""What formats can hold; those that are not named hold ranges alone."""
+"""What formats can hold one of alone; those that are not named hold ranges, and those without any hold all there is."""
 _RANGE_ALONE: tuple[Content, ...] = ("range",)
 
 
@@ -66,8 +72,8 @@ def export_frames(
     frames : FrameSet
         The frame set.
     path : path-like
-        The file, or for ``png16``, ``ply``, ``bop`` and ``rosbag`` the folder, to write.
-    to : {"npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag"}
+        The file, or for ``png16`` and the formats after it the folder, to write.
+    to : {"npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag", "webdataset", "lerobot"}
         docs/formats.md says what each holds.
     quantity : {"range", "z"}, optional
         What ``npz``, ``csv`` and ``png16`` hold; range if left out. BOP and ROS prescribe z.

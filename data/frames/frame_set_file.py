@@ -119,6 +119,11 @@ class FrameSet(StoredScene):
         return cls(file, path)
 
     @property
+    def arrays(self) -> tuple[str, ...]:
+        """Keys of the arrays of a sample, without its truth of single numbers."""
+        return tuple(_key(name) for name in self._fields)
+
+    @property
     def holds_histograms(self) -> bool:
         """Whether histograms of a direct sensor are stored."""
         return "histogram" in self._fields
