@@ -10,12 +10,13 @@ from programs import fuzzing
 
 SOAK = {
     "npy": 20_000, "npz": 12_000, "png": 12_000, "csv": 15_000, "board": 12_000, "poses": 12_000, "manifest": 2_000,
-    "bank-plan": 1_500, "frames-plan": 1_500, "sweep-plan": 1_500, "drive-plan": 1_500, "design-plan": 1_500,
+    "bank-plan": 1_500, "frames-plan": 1_500, "scenes-plan": 1_500, "sweep-plan": 1_500,
+    "drive-plan": 1_500, "design-plan": 1_500,
     "sensor": 3_000, "camera-info": 3_000, "map": 3_000,
     "checksum": 2_000, "stl": 6_000, "ply": 6_000, "obj": 6_000, "off": 6_000, "bag": 1_000, "h5": 300, "bank": 300,
-    "frames": 300,
+    "frames": 300, "scenes": 300,
 }  # fmt: skip
-"""Inputs of each kind: 129 400 in all. Kinds of HDF5 are read by a child process first, a fraction of a second each."""
+"""Inputs of each kind: 131 200 in all. Kinds of HDF5 are read by a child process first, a fraction of a second each."""
 TOML = [kind for kind, (suffix, *_) in fuzzing.KINDS.items() if suffix == ".toml"]
 SEED = 20261
 

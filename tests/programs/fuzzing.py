@@ -61,7 +61,7 @@ WORDS = (
     b"\xef\xbb\xbf", b"O", b"<f8", b"|O", b"<U9", b"<c16", b"|V0", b"t_ms", b"range_0", b"mm_0", b"status_0", b"=",
 )  # fmt: skip
 NUMBERS = (0, 1, 2**16 - 1, 2**31 - 1, 2**32 - 1)
-SAMPLES = ("bank", "frames", "h5")
+SAMPLES = ("bank", "frames", "scenes", "h5")
 """Kinds that are read by a child process of the guard first, which takes a fraction of a second each."""
 
 
@@ -96,6 +96,7 @@ def whole_bank(path: Path) -> None:
 def whole_frames(path: Path) -> None:
     with open_frames(path, untrusted=True) as found:
         found.frames()
+        found[0]
         found.info()
 
 
@@ -249,6 +250,15 @@ def _good_frames(folder: Path) -> list[bytes]:
     return [(folder / "f.h5").read_bytes()]
 
 
+def _good_scenes(folder: Path) -> list[bytes]:
+    from phasemark.data import build_frames
+    from phasemark.data.plans import SceneFramesPlan
+
+    scenes = {"generator": "own_generators:drive", "n": 2, "steps": 3, "bodies": 2, "classes": ["ball", "wall"]}
+    build_frames(SceneFramesPlan(scenes=scenes), folder / "s.h5").close()
+    return [(folder / "s.h5").read_bytes()]
+
+
 def _good_bag(folder: Path) -> list[bytes]:
     from phasemark.data import build_frames
     from phasemark.data.export import export_frames
@@ -276,6 +286,7 @@ KINDS: dict[str, tuple[str, Callable[[Path], object], Callable[[Path], list[byte
     **{kind: (f".{kind}", mesh, _good_mesh(kind)) for kind in ("stl", "ply", "obj", "off")},
     "bag": ("", stated_frames, _good_bag), "h5": (".h5", stated_frames, _good_h5),
     "bank": (".h5", whole_bank, _good_bank), "frames": (".h5", whole_frames, _good_frames),
+    "scenes": (".h5", whole_frames, _good_scenes),
 }  # fmt: skip
 """For each kind of file: how its name ends, its reader, and what makes small good files of it."""
 
