@@ -31,7 +31,7 @@ from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog, mesh_figure
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.drive import default_drive, drive_figure, run_drive
-from phasemark.render import Background, Renderer, capture, preset
+from phasemark.render import Background, Renderer, SceneRenderer, capture, preset
 from phasemark.render.figures import draw_range, landmark_limits_m
 
 IMAGES = Path(__file__).parent / "images"
@@ -75,6 +75,7 @@ SOURCES = {
     "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py", "render/charts.py"),
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),
+    "scenes.png": ("docs/figures.py", "docs/scenes.md", "render/figures.py"),
     "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py", "render/charts.py"),
 }
 """What decides how a figure looks, beside the physics: plans, and the code that draws."""
@@ -183,6 +184,40 @@ def cost_figure(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
+def scene_figure() -> Figure:
+    """Draw the scene of the page on scenes: finely, what fills most of each zone, and zones beside centre rays."""
+    page = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {}
+    exec(page, names)
+    scene, images = names["scene"], names["images"]
+    sensor, finer = images.sensor, 15
+    fine = sensor.with_(rows=sensor.rows * finer, cols=sensor.cols * finer, histogram=None)
+    range_m = SceneRenderer(scene, fine).render(np.eye(4)).range_m[0]
+    centre_m = range_m[finer // 2 :: finer, finer // 2 :: finer]
+    zone_m = SceneRenderer(scene, sensor.with_(histogram=None)).render(np.eye(4)).range_m[0]
+    figure = Figure(figsize=(13.0, 3.6), layout="constrained")
+    left, shares, middle, right = figure.subplots(1, 4)
+    near, far = float(np.nanmin(range_m)), float(np.nanmax(range_m))
+    for axes, values, title in ((left, range_m, "range"), (middle, zone_m, "range of zones")):
+        draw_range(axes, values, near_m=near, far_m=far, colour_bar=axes is middle)
+        axes.set_title(title)
+    largest = images.shares[0].argmax(axis=-1)
+    drawn = shares.imshow(largest, cmap="tab10", vmin=-0.5, vmax=9.5)
+    for (row, col), share in np.ndenumerate(images.shares[0].max(axis=-1)):
+        shares.text(col, row, f"{100 * share:.0f}", ha="center", va="center", fontsize=6)
+    bar = figure.colorbar(drawn, ax=shares, ticks=range(len(scene)), boundaries=np.arange(len(scene) + 1) - 0.5)
+    bar.ax.set_yticklabels(scene.names)
+    shares.set_title("largest body, % of zone")
+    off = 1e3 * (centre_m - zone_m)
+    drawn = right.imshow(off, cmap="coolwarm", vmin=-100, vmax=100)
+    figure.colorbar(drawn, ax=right, label="mm, beyond 100 cut off", extend="both")
+    right.set_title("centre ray less zone")
+    for axes in (shares, right):
+        axes.set_xticks([])
+        axes.set_yticks([])
+    return figure
+
+
 def write(figure: Figure, name: str) -> None:
     """Write a figure."""
     buffer = io.BytesIO()
@@ -203,6 +238,7 @@ def main() -> None:
         return
     runs = arguments.runs
     write(demo_figure(), "demo.png")
+    write(scene_figure(), "scenes.png")
     write(drive_figure(run_drive(default_drive())), "drive.png")
     for command, figures in LEFT_BY.items():
         made = made_by(f"{command} --force", [OUT / source for source in figures.values()], runs, *PHASEMARK)

@@ -41,18 +41,19 @@ def random_solids(rng: np.random.Generator, n: int) -> list[Solid]:
         size, kind = rng.uniform(0.05, 0.25), str(rng.choice(["box", "sphere", "capsule"]))
         place = np.array([rng.uniform(0.5, 2.5), rng.uniform(-0.8, 0.8), rng.uniform(0.0, 0.9)])
         rotation = Rotation.random(random_state=int(rng.integers(1 << 31))).as_matrix()
-        sizes = {"box": rng.uniform(0.3, 1.2, 3) * size, "sphere": (0.7 * size,), "capsule": (0.4 * size, size)}[kind]
+        box: tuple[float, ...] = tuple(rng.uniform(0.3, 1.2, 3) * size)
+        sizes = {"box": box, "sphere": (0.7 * size,), "capsule": (0.4 * size, size)}[kind]
         if kind == "box" and rng.random() < 0.5:
             rotation, place[2] = np.eye(3), sizes[2]  # stands on the top
         if rng.random() < 0.3:
             place = solids[-1].place + rng.normal(0, 0.04, 3)
-        solids.append(Solid(kind, tuple(sizes), rotation, place, rng.uniform(0.2, 0.9)))
+        solids.append(Solid(kind, sizes, rotation, place, rng.uniform(0.2, 0.9)))
     return solids
 
 
 def errors(solids: list[Solid], camera: Array, sensor: Any, n: int) -> tuple[float, float]:
     """Largest error of phasors, in the brightest pixel, and of shares."""
-    image = SceneRenderer(Scene(body_of(solid) for solid in solids), sensor).render(camera)
+    image = SceneRenderer(Scene(body_of(solid) for solid in solids), sensor).phasors(camera)
     half = math.radians(sensor.half_angle_h_deg)
     phasor, shares = pixels(solids, camera, (sensor.rows, sensor.cols), half, sensor.modulation_hz, n)
     assert image.shares is not None
@@ -89,7 +90,7 @@ def test_a_landmark_alone_is_rendered_as_by_its_renderer(name):
     # the lens stands at distance D on the side δ of the landmark and looks at its axis
     lens = Renderer(mesh, sensor).render(1.0, 0.4).views.lens_in_landmark()[0]
     rotation = expected.views.landmark2cam()[0][0].T
-    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(placed(lens, rotation))
+    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).phasors(placed(lens, rotation))
     scale = np.abs(expected.phasor).max()
     np.testing.assert_allclose(image.phasor / scale, expected.phasor / scale, atol=1e-9)
     np.testing.assert_allclose(image.coverage, expected.coverage, atol=1e-9)
@@ -101,13 +102,13 @@ def test_a_wall_and_a_floor_behind_a_scene_are_those_of_the_renderer(pitch):
     behind = Background(wall_m=2.5, floor_m=0.4)
     expected = Renderer(mesh, sensor, albedo=0.8).render(1.0, 0.4, pitch_rad=pitch, background=behind)
     camera = placed(expected.views.lens_in_landmark()[0], expected.views.landmark2cam()[0][0].T)
-    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, behind)
+    image = SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).phasors(camera, None, behind)
     scale = np.abs(expected.phasor).max()
     np.testing.assert_allclose(image.phasor / scale, expected.phasor / scale, atol=1e-6)
     with pytest.raises(UsageError, match=r"through the floor at 0\.01 m"):
-        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, Background(floor_m=0.01))
+        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).phasors(camera, None, Background(floor_m=0.01))
     with pytest.raises(UsageError, match=r"through the wall at 0\.9 m"):
-        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).render(camera, None, Background(wall_m=0.9))
+        SceneRenderer(Scene([Body(mesh, 0.8)]), sensor).phasors(camera, None, Background(wall_m=0.9))
 
 
 def test_histograms_of_a_scene_are_those_of_the_landmark_and_sum_up():
@@ -135,7 +136,7 @@ def test_a_room_seen_from_inside_has_no_gap():
     np.testing.assert_allclose(image.coverage, 1.0, atol=1e-9)
     solid = Body(trimesh.creation.box((4.0, 3.0, 2.5)), name="solid")
     with pytest.raises(UsageError, match="in frame 2 the lens is inside body 'solid'"):
-        SceneRenderer(Scene([solid]), WIDE).render([placed((5, 0, 0)), placed((0, 5, 0)), placed()])
+        SceneRenderer(Scene([solid]), WIDE).phasors([placed((5, 0, 0)), placed((0, 5, 0)), placed()])
 
 
 def test_moving_bodies_are_rendered_as_where_they_stand():
@@ -145,12 +146,12 @@ def test_moving_bodies_are_rendered_as_where_they_stand():
     cameras = np.repeat(placed((-0.4, 0, 0.4))[None], n, axis=0)
     moving = np.repeat(renderer.scene.poses[None], n, axis=0)
     moving[:, 3, :3, 3] += rng.normal(0, 0.2, (n, 3))  # the fourth goes its way, the others stand
-    together = renderer.render(cameras, moving)
-    threads = SceneRenderer(Scene(bodies), WIDE).render(cameras, moving, workers=2)
-    named = renderer.render(cameras, {"body 3": moving[:, 3]})
+    together = renderer.phasors(cameras, moving)
+    threads = SceneRenderer(Scene(bodies), WIDE).phasors(cameras, moving, workers=2)
+    named = renderer.phasors(cameras, {"body 3": moving[:, 3]})
     for k in range(n):
         there = [Body(body.mesh, body.albedo, pose=moving[k, b]) for b, body in enumerate(bodies)]
-        alone = SceneRenderer(Scene(there), WIDE).render(cameras[k])
+        alone = SceneRenderer(Scene(there), WIDE).phasors(cameras[k])
         np.testing.assert_array_equal(together.phasor[k], alone.phasor[0])
         np.testing.assert_array_equal(together.shares[k], alone.shares[0])
     np.testing.assert_array_equal(together.phasor, threads.phasor)
@@ -160,8 +161,8 @@ def test_moving_bodies_are_rendered_as_where_they_stand():
 def test_both_intersectors_see_the_same_scene():
     scene = Scene(body_of(solid) for solid in random_solids(np.random.default_rng(8), 8))
     camera = placed((-0.4, 0.1, 0.5))
-    embree = SceneRenderer(scene, WIDE).render(camera)
-    own = SceneRenderer(scene, WIDE, intersector="float64").render(camera)
+    embree = SceneRenderer(scene, WIDE).phasors(camera)
+    own = SceneRenderer(scene, WIDE, intersector="float64").phasors(camera)
     np.testing.assert_allclose(own.phasor, embree.phasor, atol=2e-5 * np.abs(embree.phasor).max())
 
 
@@ -171,7 +172,7 @@ def test_each_face_may_have_its_albedo_and_what_is_open_is_seen_from_both_sides(
     front = placed((1, 0, 0), Rotation.from_euler("y", 90, degrees=True).as_matrix())
     back = placed((1, 0, 0), Rotation.from_euler("y", -90, degrees=True).as_matrix())
     for pose in (front, back):
-        one = SceneRenderer(Scene([Body(plane, 0.5, pose=pose)]), sensor).render(np.eye(4))
+        one = SceneRenderer(Scene([Body(plane, 0.5, pose=pose)]), sensor).phasors(np.eye(4))
         two = SceneRenderer(Scene([Body(plane, np.array([0.25, 0.75]), pose=pose)]), sensor).render(np.eye(4))
         # the rays' amplitude is the albedo times cos θ / r², and the diagonal halves the image
         assert abs(two.intensity.sum() / one.intensity.sum() - 1) < 1e-6
@@ -210,18 +211,18 @@ def test_a_file_with_materials_becomes_a_scene(tmp_path):
     [
         (lambda: Scene([]), "needs at least one body"),
         (lambda: Scene([Body.sphere(1, name="a"), Body.sphere(2, name="a")]), "two bodies are named 'a'"),
-        (lambda: Scene(["box"]), "made of Body objects, got str"),
+        (lambda: Scene(["box"]), "made of Body objects, got str"),  # type: ignore[list-item]
         (lambda: Body.sphere(-1), "positive numbers of metres"),
         (lambda: Body.box((1, 2)), "'size_m' must be 3 positive numbers"),
         (lambda: Body.sphere(1, albedo=1.2), r"'albedo' must be in \[0, 1\], got 1.2"),
         (lambda: Body(trimesh.creation.box(), np.ones(3)), "one for each of 12 faces"),
         (lambda: Body.sphere(1, pose=np.full((4, 4), np.nan)), "pose of a body' must be finite"),
         (lambda: Body.sphere(1, name="x", pose=np.diag([2, 1, 1, 1])), "pose of body 'x'' must be a rotation"),
-        (lambda: Body.height_field([[0, np.nan], [0, 0]], (1, 1)), "'heights_m' must be finite"),
+        (lambda: Body.height_field(np.diag([0, np.nan]), (1, 1)), "'heights_m' must be finite"),
         (lambda: Scene([Body.sphere(1)]).posed({"y": np.eye(4)}, 1), "no body is named 'y'"),
         (lambda: Scene([Body.sphere(1)]).posed(np.zeros((3, 3)), 1), "'bodies2world' must have shape"),
-        (lambda: SceneRenderer("scene", WIDE), "'scene' must be a Scene"),
-        (lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).render(np.eye(3)), "'camera2world' must have shape"),
+        (lambda: SceneRenderer("scene", WIDE), "'scene' must be a Scene"),  # type: ignore[arg-type]
+        (lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).phasors(np.eye(3)), "'camera2world' must have shape"),
     ],
 )
 def test_what_is_no_scene_is_refused_in_words(make, message):
