@@ -106,7 +106,8 @@ def test_the_example_of_a_plan_is_a_plan_and_fits_its_schema(tmp_path, kind):
     found, plan = check_plan(path)
     assert found == kind
     given = type(plan)(**tomllib.loads(plan_example(kind)))
-    assert plan == (given.resolve() if hasattr(given, "resolve") else given)
+    runs_a_program = kind == "scenes"  # to resolve it, and a check runs none
+    assert plan == (given.resolve() if hasattr(given, "resolve") and not runs_a_program else given)
     assert plan == check_plan(path, kind)[1]
     schema = plan_schema(kind)
     assert set(tomllib.loads(plan_example(kind))) <= set(schema["properties"])
@@ -128,7 +129,7 @@ def test_plan_commands_print_and_check(tmp_path, capsys):
     assert main(["plan", "check", str(path)]) == 2
     assert re.search(r"plan\.toml: 'views' must be .* got -1", capsys.readouterr().err)
     assert main(["plan", "schema", "tour"]) == 2
-    assert "'tour' is not one of 'bank', 'frames', 'sweep', 'drive'" in capsys.readouterr().err
+    assert "'tour' is not one of 'bank', 'frames', 'scenes', 'sweep', 'drive'" in capsys.readouterr().err
     with pytest.raises(UsageError, match="unknown kind of plan 'tour'"):
         plan_schema("tour")
 
