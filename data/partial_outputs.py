@@ -191,9 +191,10 @@ def build_part(
     """
     inputs = named_files(plan.model_dump())
     refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
+    job = job_for(plan)
     return produce(
-        PartJob(job_for(plan), *part), path, finished=_finished_identity, force=force, resume=resume, workers=workers,
-        shard_items=shard_items, scheduler=scheduler, progress=progress,
+        PartJob(job, *part), path, finished=_finished_identity, force=force, resume=resume, workers=workers,
+        shard_items=shard_items or job.shard_items, scheduler=scheduler, progress=progress,
     )  # fmt: skip
 
 

@@ -63,6 +63,8 @@ class SceneJob(ABC, Generic[P]):
     KIND: ClassVar[str]
     """Name of the kind of job, for :func:`phasemark.data.partial_outputs.job_of`."""
     STORED: ClassVar[type[StoredScene]]
+    shard_items: int | None = None
+    """Items made at a time where nobody says how many; None: about 4 MiB of them."""
     fields: Sequence[str]
     """Names of the arrays of an item, in the order in which :meth:`make` returns them."""
     maker = "phasemark.data.partial_outputs:job_of"

@@ -272,6 +272,15 @@ def test_scenes_come_from_files_with_cameras_and_labels(tmp_path: Path) -> None:
         verify_frames(tmp_path / "files.h5", sample=2)
 
 
+def test_a_file_with_y_up_is_turned(tmp_path: Path) -> None:
+    high = trimesh.creation.box((2.0, 0.1, 2.0), transform=at(0.0, 3.0))  # a ceiling 2.95 m above, y up
+    trimesh.Scene({"ceiling": high}).export(tmp_path / "ceiling.glb")
+    cameras = [{"position_m": (0.0, 0.0, 1.0), "pitch_deg": -90.0}]
+    scenes = {"list": [{"path": str(tmp_path / "ceiling.glb"), "up": "y", "cameras": cameras}]}
+    with build_frames(SceneFramesPlan(scenes=scenes), tmp_path / "up.h5", workers=1) as found:
+        np.testing.assert_allclose(found[0]["range_mixed_m"] * found.sensor.axis_cosine(), 1.95, rtol=2e-4)
+
+
 # --- what is refused -------------------------------------------------------------------------------------------------
 
 

@@ -98,7 +98,7 @@ def build_frames(
     job.check_views()
     produce(
         job, path, finished=job.finished_identity, force=force, resume=resume, workers=workers,
-        shard_items=shard_items, scheduler=scheduler, progress=progress,
+        shard_items=shard_items or job.shard_items, scheduler=scheduler, progress=progress,
     )  # fmt: skip
     return open_frames(path)
 

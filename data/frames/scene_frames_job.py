@@ -23,6 +23,8 @@ from phasemark.render import Body, PhasorImages, Scene, SceneRenderer, Sensor
 from phasemark.render.direct import HistogramImages
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 
+_SHARD_VIEWS = 64
+"""Of a shard: they take up to a second, so that workers have enough of them and a killed run loses little."""
 _RENDERERS = 32
 """Most scenes of other bodies whose meshes are kept analysed."""
 _SPECK_M = 1e-4
@@ -46,6 +48,7 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
         plan = plan.resolve()
         refuse_too_many(plan)
         self.views_per_item = plan.scenes.steps
+        self.shard_items = max(1, _SHARD_VIEWS // plan.scenes.steps)
         super().__init__(plan, plan.build_sensor(), [])
         self._renderers = _Renderers(self.sensor)
         self._known_source: SceneSource | None = None

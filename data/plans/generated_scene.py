@@ -220,9 +220,17 @@ def _check_labels(own: Mapping[str, NDArray[Any]], due: Mapping[str, str]) -> No
             raise UsageError(f"the label '{name}' must be a {kind} as in scene 0, got a {found}")
 
 
-def scene_of_file(path: str, cameras: Sequence[Mapping[str, Any]], labels: Mapping[str, Label]) -> GeneratedScene:
-    """Return the scene of a file, with camera poses given by position and angles."""
-    return GeneratedScene(Scene.read(path), np.array([camera_pose(**camera) for camera in cameras]), labels)
+_Y_UP = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""Turns y up to z up; x stays."""
+
+
+def scene_of_file(
+    path: str, up: str, cameras: Sequence[Mapping[str, Any]], labels: Mapping[str, Label]
+) -> GeneratedScene:
+    """Return the scene of a file, z or y up, with camera poses given by position and angles."""
+    scene = Scene.read(path)
+    poses = _Y_UP @ scene.poses if up == "y" else scene.poses
+    return GeneratedScene(scene, np.array([camera_pose(**camera) for camera in cameras]), labels, poses)
 
 
 def camera_pose(

@@ -69,7 +69,9 @@ class SceneFile(PlanModel):
     Parameters
     ----------
     path : str
-        glTF, GLB, OBJ with materials, PLY and others, in metres, z up; relative to the plan's folder.
+        glTF, GLB, OBJ with materials, PLY and others, in metres; relative to the plan's folder.
+    up : {"z", "y"}
+        Axis of the file that points up; it is turned to z. glTF prescribes y.
     cameras : sequence of CameraPlace
         Where the camera stands, one for each step.
     labels : mapping of str to number or str
@@ -77,6 +79,7 @@ class SceneFile(PlanModel):
     """
 
     path: Annotated[str, AfterValidator(without_nul)]
+    up: Literal["z", "y"] = "z"
     cameras: Annotated[tuple[CameraPlace, ...], Field(min_length=1)]
     labels: dict[str, _Finite | str] = Field(default_factory=dict)
 
@@ -336,7 +339,7 @@ class SceneSource:
 
             def make(index: int, rng: np.random.Generator) -> GeneratedScene:
                 each = scenes.list[index]
-                return scene_of_file(each.path, [camera.model_dump() for camera in each.cameras], each.labels)
+                return scene_of_file(each.path, each.up, [one.model_dump() for one in each.cameras], each.labels)
         else:
             program, sha256 = imported_generator(name)
 
