@@ -126,13 +126,23 @@ def test_histograms_of_a_scene_are_those_of_the_landmark_and_sum_up():
     assert frames.counts.shape == (1, 3, 8, 8, sensor.histogram.bins)
 
 
+@pytest.mark.parametrize("height_m", [0.05, 0.3])
+def test_a_body_seen_at_a_slant_is_resolved_in_range_as_a_floor_behind(height_m):
+    sensor = preset("vl53l5cx-8x8")
+    expected = HistogramRenderer(None, sensor).render(1.0, background=Background(floor_m=height_m, floor_albedo=0.5))
+    floor = Body.plane((60, 60), albedo=0.5, pose=placed((0, 0, -height_m)))
+    image = SceneRenderer(Scene([floor]), sensor).histograms(np.eye(4))
+    near = expected.signal > 1e-3 * expected.signal.max()
+    scale = expected.expected.max(axis=-1, keepdims=True)
+    assert (np.abs(image.expected - expected.expected) / scale)[near].max() < 5e-3
+
+
 def test_a_room_seen_from_inside_has_no_gap():
     room = trimesh.creation.box((4.0, 3.0, 2.5))
     room.invert()
     cameras = np.array([placed((0.3, 0.2, 0.1), Rotation.from_euler("z", k).as_matrix()) for k in range(6)])
-    image = SceneRenderer(Scene([Body(room, 0.5, "room"), Body.sphere(0.2, pose=placed((1, 0.5, 0)))]), WIDE).render(
-        cameras
-    )
+    scene = Scene([Body(room, 0.5, "room"), Body.sphere(0.2, pose=placed((1, 0.5, 0)))])
+    image = SceneRenderer(scene, WIDE).phasors(cameras)
     np.testing.assert_allclose(image.coverage, 1.0, atol=1e-9)
     solid = Body(trimesh.creation.box((4.0, 3.0, 2.5)), name="solid")
     with pytest.raises(UsageError, match="in frame 2 the lens is inside body 'solid'"):
@@ -173,7 +183,7 @@ def test_each_face_may_have_its_albedo_and_what_is_open_is_seen_from_both_sides(
     back = placed((1, 0, 0), Rotation.from_euler("y", -90, degrees=True).as_matrix())
     for pose in (front, back):
         one = SceneRenderer(Scene([Body(plane, 0.5, pose=pose)]), sensor).phasors(np.eye(4))
-        two = SceneRenderer(Scene([Body(plane, np.array([0.25, 0.75]), pose=pose)]), sensor).render(np.eye(4))
+        two = SceneRenderer(Scene([Body(plane, np.array([0.25, 0.75]), pose=pose)]), sensor).phasors(np.eye(4))
         # the rays' amplitude is the albedo times cos θ / r², and the diagonal halves the image
         assert abs(two.intensity.sum() / one.intensity.sum() - 1) < 1e-6
         assert two.intensity.max() / one.intensity.max() == pytest.approx(1.5, rel=1e-2)

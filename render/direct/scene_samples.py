@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, of_poses, topology_of
-from phasemark.render.integral.arguments import Camera, Poses, towards_level
+from phasemark.render.integral.area_integral import NO_LEAST, Buffers, camera_poses, find_faces, of_poses, topology_of
+from phasemark.render.integral.arguments import Camera, Poses, towards_landmark, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.light import landmark_hit
@@ -87,15 +87,16 @@ class SceneMesh:
 
     @classmethod
     def of_surface(cls, topology: MeshTopology, intersector: Intersector, n_parts: int) -> SceneMesh:
-        """Take samples of a surface that has been analysed, of so many parts."""
+        """Take samples of an analysed surface of `n_parts` parts, and resolve ranges of faces seen at a slant."""
         surface = cls.__new__(cls)
-        surface._use(topology, intersector, n_parts)
+        surface._use(topology, intersector, n_parts, resolves=True)
         return surface
 
-    def _use(self, topology: MeshTopology, intersector: Intersector, n_parts: int) -> None:
+    def _use(self, topology: MeshTopology, intersector: Intersector, n_parts: int, *, resolves: bool = False) -> None:
         self.topology = topology
         self._intersector = intersector
         self._n_parts = n_parts
+        self._resolves = resolves
         self._idle: defaultdict[tuple[int, int], list[Buffers]] = defaultdict(list)
         """Scratch that no thread is using, by the size of its grid."""
 
@@ -176,25 +177,38 @@ class SceneMesh:
         # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
         radians_per_scale = 1.5
         fastest = radians_per_scale / scale[0] if behind else 0.0
-        while True:
-            reached, n = plan_rays(
-                0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state,
-                buffers.borders,
-            )  # fmt: skip
-            if reached == 1:
-                break
-            buffers.make_room(reached)
+        n = self._planned(NO_LEAST, pose, grid, fastest, state, buffers)
+        if self._resolves:
+            least = np.ones((rows, cols, 2), np.int64)
+            _count_boxes(n, buffers.samples, mesh, pose, grid, scale, least)
+            if (least > 1).any():
+                n = self._planned(least, pose, grid, fastest, state, buffers)
         samples = buffers.samples
-
-        find_faces(n, samples, state, mesh, self._intersector, pose, grid)
         more = _count_free(state[0], pose, grid, background, scale) if behind else 0
         numbers = (np.empty(n + more) for _ in range(3))
-        columns = np.empty((n + more, 2)), *numbers, np.empty(n + more, np.int32)
+        columns: tuple[NDArray[Any], ...] = np.empty((n + more, 2)), *numbers, np.empty(n + more, np.int32)
         kept = _hits(n, samples, mesh, pose, grid, background, self._n_parts, columns)
         idle.append(buffers)
         if more:
             kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
         return tuple(column[:kept] for column in columns)
+
+    def _planned(
+        self, least: NDArray[np.int64], pose: Poses, grid: Camera, fastest: float, state: NDArray[np.uint8],
+        buffers: Buffers,
+    ) -> int:  # fmt: skip
+        """Place the samples of a pose, find what they see, and return how many there are."""
+        mesh = self.topology
+        while True:
+            reached, n = plan_rays(
+                0, mesh, pose, grid, 1, fastest, least, buffers.edges, buffers.scratch, buffers.samples, state,
+                buffers.borders,
+            )  # fmt: skip
+            if reached == 1:
+                break
+            buffers.make_room(reached)
+        find_faces(n, buffers.samples, state, mesh, self._intersector, pose, grid)
+        return int(n)
 
 
 def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float] = (0.0, 0.0)) -> SceneSamples:
@@ -250,6 +264,36 @@ def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[n
     areas[k] = weight * area
     parts[k] = part
     return k + 1
+
+
+@kernel
+def _count_boxes(n, samples, mesh, poses, camera, scale, least):  # type: ignore[no-untyped-def]
+    """Raise the boxes of cells along which the range of what is seen changes by more than `scale` asks for.
+
+    Where the ray (1, y, z) meets a plane, its multiple t changes with y as −t (n · ∂d/∂y) / (n · d).
+    """
+    matrix, lens = poses.matrix[0], poses.lens[0]
+    finest_m, farthest_m = scale
+    for k in range(n):
+        f = samples.face[k]
+        if f < 0:
+            continue
+        y, z = samples.rays[k, 0], samples.rays[k, 1]
+        dx, dy, dz = towards_landmark(matrix, y, z)
+        nx, ny, nz, d = mesh.planes[f, 0], mesh.planes[f, 1], mesh.planes[f, 2], mesh.planes[f, 3]
+        facing = nx * dx + ny * dy + nz * dz
+        if facing == 0.0:
+            continue
+        range_m = abs((d - nx * lens[0] - ny * lens[1] - nz * lens[2]) / facing) * math.sqrt(1.0 + y * y + z * z)
+        if range_m > farthest_m:
+            continue
+        across = abs((nx * matrix[1, 0] + ny * matrix[1, 1] + nz * matrix[1, 2]) / facing) * camera.slope_u
+        down = abs((nx * matrix[2, 0] + ny * matrix[2, 1] + nz * matrix[2, 2]) / facing) * camera.slope_v
+        pixel = samples.pixel[k]
+        row, col = pixel // camera.cols, pixel % camera.cols
+        n_u = int(min(math.ceil(range_m * across / finest_m), _MOST_BOXES))
+        n_v = int(min(math.ceil(range_m * down / finest_m), _MOST_BOXES))
+        least[row, col, 0], least[row, col, 1] = max(least[row, col, 0], n_u), max(least[row, col, 1], n_v)
 
 
 @kernel

@@ -41,6 +41,10 @@ _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 
 
+NO_LEAST = np.empty((0, 0, 2), np.int64)
+"""No pixel asks for more boxes than all."""
+
+
 @dataclass
 class Buffers:
     """Scratch of one thread; grows when a view needs more."""
@@ -128,7 +132,7 @@ def _room_for_borders(n: int, p: int) -> Borders:
 
 @dataclass(frozen=True)
 class Slopes:
-    """How the phasors change with the parameters of a view, to be filled beside the sums.
+    """Slopes of the phasors with the parameters of a view, filled beside the sums.
 
     Parameters
     ----------
@@ -264,7 +268,7 @@ class AreaIntegral:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges,
+                    view, mesh, poses, camera, self.splits, light.fastest, NO_LEAST, buffers.edges,
                     buffers.scratch, buffers.samples, own.state, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:

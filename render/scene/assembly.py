@@ -118,7 +118,7 @@ class Assembly:
             )
 
     def _joined(self) -> MeshTopology:
-        """Return what does not depend on poses, with room for what does."""
+        """Join the arrays that do not depend on poses, and make room for those that do."""
         own, first = self._own, self._first
         faces = [mesh.faces + first.vertex[b] for b, mesh in enumerate(own)]
         creases = [_shifted(mesh.creases, first.vertex[b], first.face[b]) for b, mesh in enumerate(own)]
@@ -213,7 +213,7 @@ class Assembly:
         )
 
     def _intersectors(self) -> Intersector:
-        """Return what finds the first face: of what stands still, and of each body that moves in its own frame."""
+        """Return the intersector: of all that stands still, and of each body that moves in its own frame."""
         mesh = self._base
         if self._still is None:
             numbers = np.flatnonzero(~self._moving[mesh.part])
@@ -361,7 +361,7 @@ def _turn_plane(plane, transposed, offset, sign, out):  # type: ignore[no-untype
 
 
 class _Firsts(NamedTuple):
-    """Where the arrays of each body begin in those of the scene, (b + 1,) each."""
+    """First places of the arrays of each body in those of the scene, (b + 1,) each."""
 
     vertex: NDArray[np.int64]
     face: NDArray[np.int64]
