@@ -276,7 +276,7 @@ def _count_boxes(n, samples, mesh, poses, camera, scale, least):  # type: ignore
     finest_m, farthest_m = scale
     for k in range(n):
         f = samples.face[k]
-        if f < 0:
+        if f < 0 or not mesh.flat[f] or mesh.quadric[f] >= 0:  # round surfaces are at a slant beside their outline only
             continue
         y, z = samples.rays[k, 0], samples.rays[k, 1]
         dx, dy, dz = towards_landmark(matrix, y, z)
@@ -291,8 +291,9 @@ def _count_boxes(n, samples, mesh, poses, camera, scale, least):  # type: ignore
         down = abs((nx * matrix[2, 0] + ny * matrix[2, 1] + nz * matrix[2, 2]) / facing) * camera.slope_v
         pixel = samples.pixel[k]
         row, col = pixel // camera.cols, pixel % camera.cols
-        n_u = int(min(math.ceil(range_m * across / finest_m), _MOST_BOXES))
-        n_v = int(min(math.ceil(range_m * down / finest_m), _MOST_BOXES))
+        spread_m = range_m * min(4.0 * samples.weights[k], 1.0)  # a face that fills a cell has four samples there
+        n_u = int(min(math.ceil(spread_m * across / finest_m), _MOST_BOXES))
+        n_v = int(min(math.ceil(spread_m * down / finest_m), _MOST_BOXES))
         least[row, col, 0], least[row, col, 1] = max(least[row, col, 0], n_u), max(least[row, col, 1], n_v)
 
 
