@@ -451,7 +451,7 @@ class FrameSet(StoredScene):
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
             **({"bins": histogram.bins, "max_targets": histogram.max_targets} if histogram is not None else {}),
-            "mesh_sha256": self.identity()["mesh_sha256"],
+            **({"mesh_sha256": meshes} if (meshes := self.identity()["mesh_sha256"]) else {}),
             "versions": self.versions,
         }
 

@@ -15,7 +15,7 @@ from trimesh.caching import TrackedArray
 from phasemark import UsageError
 from phasemark.data.frames.frame_set_file import SceneFrameSet
 from phasemark.data.frames.frames_job import Column, FramesJob, joined_images
-from phasemark.data.plans.arrays import SEQUENCE, sizes_of_scenes
+from phasemark.data.plans.arrays import POSE_FIELDS, SEQUENCE, sizes_of_scenes
 from phasemark.data.plans.generated_scene import PlacedScene, class_of_body
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan, SceneSource
 from phasemark.data.plans.size import refuse_too_many
@@ -110,8 +110,8 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
             image = HistogramImages(expected, signal, self.sensor)
         stored["shares"] = np.concatenate([self._of_classes(*pair) for pair in zip(scenes, shots, strict=True)])
         if "poses" in self.plan.keep:
-            for name in ("camera2world", "bodies2world", "class_of_body"):
-                stored[name] = np.concatenate([self._poses(scene)[name] for scene in scenes])
+            poses = [self._poses(scene) for scene in scenes]
+            stored |= {name: np.concatenate([own[name] for own in poses]) for name in POSE_FIELDS}
         for name in self.plan.scenes.labels or {}:
             stored[f"label_{name}"] = np.concatenate([scene.labels[name] for scene in scenes])
         return {

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.inputs.own_program import called_program, imported_program
 from phasemark.render import Background, Scene
-from phasemark.render.rigid import rigid_transforms
+from phasemark.render.rigid import product, rigid_transforms, tilt2level
 
 LABEL_BYTES = 64
 """Of a label that is text, as UTF-8."""
@@ -204,10 +204,10 @@ def _label(name: str, values: Any, steps: int) -> NDArray[Any]:
         return np.array(encoded, f"S{LABEL_BYTES}")
     if not all(isinstance(value, numbers.Real) for value in given):
         raise UsageError(f"the label '{name}' must be a number or text, got {given[0]!r}")
-    numbers_ = np.array([float(value) for value in given])
-    if np.isinf(numbers_).any():
-        raise UsageError(f"the label '{name}' must be finite, or NaN where it is not there, got {numbers_.max()}")
-    return numbers_
+    array = np.array([float(value) for value in given])
+    if np.isinf(array).any():
+        raise UsageError(f"the label '{name}' must be finite, or NaN where it is not there, got {array.max()}")
+    return array
 
 
 def _check_labels(own: Mapping[str, NDArray[Any]], due: Mapping[str, str]) -> None:
@@ -250,8 +250,6 @@ def camera_pose(
     >>> camera_pose((0, 0, 2.5), pitch_deg=90)[:3, 0].round(9) + 0.0  # looks down
     array([ 0.,  0., -1.])
     """
-    from phasemark.render.rigid import product, tilt2level
-
     yaw, pitch, roll = (math.radians(angle) for angle in (yaw_deg, pitch_deg, roll_deg))
     turn = np.array([[math.cos(yaw), -math.sin(yaw), 0.0], [math.sin(yaw), math.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
     pose = np.eye(4)
