@@ -67,7 +67,7 @@ ON_TERRAIN = '<geom type="hfield" hfield="h" pos="1.3 0 -.45" rgba=".6 .6 .6 1"/
         # the error of 16 384 rays in a pixel; of curved surfaces also the facets that stand for them
         pytest.param(FLAT, '<geom type="plane" size="3 0 1" pos="0 0 -.4"/>', 1e-3, id="flat"),
         pytest.param(FLAT, ON_TERRAIN, 1e-3, id="on terrain"),
-        pytest.param(ROUND, "", 4e-3, id="round"),
+        pytest.param(ROUND, "", 1e-3, id="round"),
     ],
 )
 def test_images_and_shares_are_those_of_dense_rays(shapes, on, tolerance):
