@@ -1,6 +1,7 @@
 """Scenes of several bodies against dense rays by other code, closed forms, and the renderer of one landmark."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -160,12 +161,21 @@ def test_moving_bodies_are_rendered_as_where_they_stand():
     threads = SceneRenderer(Scene(bodies), WIDE).phasors(cameras, moving, workers=2)
     named = renderer.phasors(cameras, {"body 3": moving[:, 3]})
     for k in range(n):
-        there = [Body(body.mesh, body.albedo, pose=moving[k, b]) for b, body in enumerate(bodies)]
+        there = [replace(body, pose=moving[k, b]) for b, body in enumerate(bodies)]
         alone = SceneRenderer(Scene(there), WIDE).phasors(cameras[k])
         np.testing.assert_array_equal(together.phasor[k], alone.phasor[0])
         np.testing.assert_array_equal(together.shares[k], alone.shares[0])
     np.testing.assert_array_equal(together.phasor, threads.phasor)
     np.testing.assert_array_equal(together.phasor, named.phasor)
+
+
+def test_the_mesh_of_a_ball_that_was_stretched_is_no_ball_any_more():
+    mesh = Body.sphere(0.2).mesh.copy()
+    mesh.apply_transform(np.diag([1.0, 1.0, 2.0, 1.0]))
+    camera = placed((-1.0, 0, 0))
+    stretched = SceneRenderer(Scene([Body(mesh)]), WIDE).phasors(camera)
+    true = SceneRenderer(Scene([Body.ellipsoid((0.2, 0.2, 0.4))]), WIDE).phasors(camera)
+    np.testing.assert_allclose(stretched.phasor, true.phasor, atol=2e-3 * np.abs(true.phasor).max())
 
 
 def test_both_intersectors_see_the_same_scene():

@@ -33,11 +33,11 @@ class Surface:
         attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
-        known = getattr(body.mesh, "metadata", {})
-        if body.smooth and "quadrics" in known:
-            attributes["quadric"] = body.mesh.face_attributes["quadric"]
+        metadata: dict[str, Any] = {}
+        if body.smooth and body.quadrics is not None:
+            attributes["quadric"], metadata["quadrics"] = body.quadrics
         return cls(
-            np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, dict(known)
+            np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, metadata
         )
 
 
@@ -62,6 +62,9 @@ class Body:
     smooth : bool
         Whether normals are interpolated between faces that meet at less than 30°, as on a mesh that stands for a curved
         surface; False: every facet is flat.
+    quadrics : tuple, optional
+        Of round primitives: which quadric is the true surface of each face, (f,) int32, −1 for none, and the quadrics,
+        (q, 10), as :class:`~phasemark.render.integral.mesh_topology.MeshTopology` has them.
 
     Raises
     ------
@@ -81,6 +84,7 @@ class Body:
     name: str = ""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     smooth: bool = True
+    quadrics: tuple[NDArray[np.int32], NDArray[np.float64]] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not (hasattr(self.mesh, "vertices") and hasattr(self.mesh, "faces")):
@@ -170,7 +174,7 @@ class Body:
         ball = _turned(np.cos(angle), np.sin(angle))
         ball.vertices = ball.vertices * half * math.sqrt(4 * math.pi / ball.area)
         quadric = [*1 / half**2, 0, 0, 0, 0, 0, 0, -1]
-        return cls._of(_true_surface(ball, np.zeros(len(ball.faces)), [quadric]), albedo, name, pose)
+        return cls._of(ball, albedo, name, pose, np.zeros(len(ball.faces)), [quadric])
 
     @classmethod
     def cylinder(
@@ -189,7 +193,7 @@ class Body:
         solid = _turned(radius * _CORNER * rho, height * z)
         ends = np.abs(solid.face_normals[:, 2]) > math.sqrt(0.5)
         side = [1, 1, 0, 0, 0, 0, 0, 0, 0, -(radius**2)]
-        return cls._of(_true_surface(solid, np.where(ends, -1, 0), [side]), albedo, name, pose)
+        return cls._of(solid, albedo, name, pose, np.where(ends, -1, 0), [side])
 
     @classmethod
     def capsule(
@@ -213,7 +217,7 @@ class Body:
         balls = [[1, 1, 1, 0, 0, 0, 0, 0, -z, z**2 - radius**2] for z in (centre, -centre)]
         middle = solid.triangles_center[:, 2]
         which = np.where(middle > centre, 1, np.where(middle < -centre, 2, 0))
-        return cls._of(_true_surface(solid, which, [side, *balls]), albedo, name, pose)
+        return cls._of(solid, albedo, name, pose, which, [side, *balls])
 
     @classmethod
     def height_field(
@@ -266,8 +270,17 @@ class Body:
         return cls._of(solid, albedo, name, pose)
 
     @classmethod
-    def _of(cls, mesh: trimesh.Trimesh, albedo: float, name: str, pose: ArrayLike | None) -> Body:
-        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose))
+    def _of(
+        cls,
+        mesh: trimesh.Trimesh,
+        albedo: float,
+        name: str,
+        pose: ArrayLike | None,
+        which: ArrayLike | None = None,
+        quadrics: ArrayLike = (),
+    ) -> Body:
+        true = None if which is None else (np.asarray(which, np.int32), np.asarray(quadrics, np.float64))
+        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), quadrics=true)
 
 
 def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
@@ -281,10 +294,3 @@ def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
 def _turned(radius_m: ArrayLike, z_m: ArrayLike) -> trimesh.Trimesh:
     """Return a solid of revolution about z from its profile, bottom to top."""
     return trimesh.creation.revolve(np.column_stack([radius_m, z_m]), sections=SEGMENTS)
-
-
-def _true_surface(mesh: trimesh.Trimesh, which: ArrayLike, quadrics: ArrayLike) -> trimesh.Trimesh:
-    """Say which quadric the faces of a mesh stand for, −1 for none; see :class:`MeshTopology`."""
-    mesh.face_attributes["quadric"] = np.asarray(which, np.int32)
-    mesh.metadata["quadrics"] = np.asarray(quadrics, np.float64)
-    return mesh
