@@ -29,6 +29,7 @@ from matching import matching
 from mounting import design, mounting
 from policy import policy
 from regions import regions
+from scenes import scenes
 from tolerance import tolerance
 
 from phasemark.data import BankPlan, build_bank, open_bank
@@ -539,6 +540,7 @@ SECTIONS: dict[str, tuple[str, Callable[[], Table]]] = {
     "tolerance": ("In a world that is not the model's", partial(tolerance, SENSOR, SEED)),
     "direct": ("A direct sensor of 8 × 8 zones and 128 bins", partial(direct, SEED, median_seconds)),
     "regions": ("A large camera, binned", partial(regions, SENSOR, SEED)),
+    "scenes": ("Scenes of 50 bodies", partial(scenes, SEED, median_seconds)),
     "policy": ("What the tuning numbers of the search do", partial(policy, SENSOR, SEED)),
 }
 
