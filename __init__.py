@@ -68,7 +68,7 @@ _TYPES = {
 
 _PATTERNS = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]*$": "begin with a letter or digit and hold only letters, digits, '_', '.' and '-'",
-    r"^[A-Za-z0-9][A-Za-z0-9_. -]*$": "begin with a letter or digit and hold only letters, digits, spaces, '_', '.', '-'",
+    r"^[A-Za-z0-9][A-Za-z0-9_. -]*$": "begin with a letter or digit, then letters, digits, spaces, '_', '.' and '-'",
     r"^[^:\s]+:[^:\s]+$": "be MODULE:NAME of a function of your own",
     r"^(nearest|refine|[A-Za-z_][\w.]*:[A-Za-z_]\w*)$": "be nearest, refine, or MODULE:NAME of a callable of your own",
 }
