@@ -232,7 +232,7 @@ class AreaIntegral:
             self.sensor.vignetting,
             _fastest(self.sensor),
         )
-        poses_per_task = 64
+        poses_per_task = min(64, -(-n // workers)) or 1
         tasks = [slice(i, min(i + poses_per_task, n)) for i in range(0, n, poses_per_task)]
         lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
 

@@ -86,6 +86,13 @@ class Assembly:
         self._poses = body2world.copy()
         self._turn(moved)
 
+    def let_move(self, bodies: NDArray[np.bool_]) -> None:
+        """Tell which bodies will move, (b,): what stands still is then built once, for copies too."""
+        if (bodies & ~self._moving).any():
+            self._moving = self._moving | bodies
+            self._still = None
+            self.intersector = self._intersectors()
+
     def check_outside(self, lens_m: NDArray[np.float64], names: Sequence[str], frames: NDArray[np.int64]) -> None:
         """Refuse a lens inside a closed body.
 

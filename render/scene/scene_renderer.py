@@ -211,6 +211,8 @@ class SceneRenderer:
         for k in range(n):
             alike.setdefault(placings[k].tobytes(), []).append(k)
         frames = [np.array(which) for which in alike.values()]
+        if len(frames) > 1:
+            self._assembly.let_move((placings != placings[0]).any(axis=(0, 2, 3)))
         lanes = [lane for i in range(min(workers, len(frames))) if (lane := frames[i::workers])]
         threads = max(workers // max(len(lanes), 1), 1)
 
