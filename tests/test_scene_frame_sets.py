@@ -289,7 +289,7 @@ def test_a_file_with_y_up_is_turned(tmp_path: Path) -> None:
     [
         ({}, "give 'generator' = \"module:function\" or 'list' = [files], got neither"),
         ({"generator": "a:b"}, "'n' is missing"),
-        ({"generator": "ab", "n": 1}, "'generator' must match"),
+        ({"generator": "ab", "n": 1}, "'generator' must be MODULE:NAME"),
         ({"generator": "a:b", "n": 0}, "'scenes.n' must be greater than or equal to 1, got 0"),
         ({"generator": "a:b", "n": 1, "classes": ["a", "a"]}, "'classes' must not repeat"),
         ({"generator": "a:b", "n": 1, "colour": 1}, "colour"),
