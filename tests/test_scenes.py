@@ -170,7 +170,9 @@ def test_moving_bodies_are_rendered_as_where_they_stand():
 
 
 def test_the_mesh_of_a_ball_that_was_stretched_is_no_ball_any_more():
-    mesh = Body.sphere(0.2).mesh.copy()
+    mesh = Body.sphere(0.2).mesh
+    assert isinstance(mesh, trimesh.Trimesh)
+    mesh = mesh.copy()
     mesh.apply_transform(np.diag([1.0, 1.0, 2.0, 1.0]))
     camera = placed((-1.0, 0, 0))
     stretched = SceneRenderer(Scene([Body(mesh)]), WIDE).phasors(camera)
