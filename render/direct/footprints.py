@@ -154,6 +154,13 @@ def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = No
     )
 
 
+def zones_tile(sensor: Sensor) -> bool:
+    """Return True if zones are sharp, evenly lit rectangles side by side: any grid of cells then holds them exactly."""
+    histogram = histogram_of(sensor)
+    scale = np.array(histogram.zone_scale) * np.array(sensor.fill_factor)
+    return histogram.zone_blur == 0 and histogram.light_width is None and bool((scale == 1).all())
+
+
 def footprint_areas(zones: Footprints) -> NDArray[np.float64]:
     """Return the weight of each zone's footprint over its tangents, by a fine midpoint rule; (zones,)."""
     areas = np.empty(len(zones.centre))
@@ -172,14 +179,37 @@ def border_profile(offset, half, blur):  # type: ignore[no-untyped-def]
 @kernel
 def footprint_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
     """Return how strongly zone k sees the direction (1, y, z), light included."""
+    return border_weight(zones, k, y, z) * light_weight(zones, y, z)
+
+
+@kernel
+def border_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
+    """Return the share of the direction (1, y, z) that zone k sees, whatever light falls there."""
     dy, dz = y - zones.centre[k, 0], z - zones.centre[k, 1]
     if abs(dy) > zones.half[k, 0] + _REACH * zones.blur[0] or abs(dz) > zones.half[k, 1] + _REACH * zones.blur[1]:
         return 0.0
-    weight = border_profile(dy, zones.half[k, 0], zones.blur[0]) * border_profile(dz, zones.half[k, 1], zones.blur[1])
-    if zones.light[2] > 0.0:
-        ly, lz = y - zones.light[0], z - zones.light[1]
-        weight *= math.exp(-0.5 * zones.light[2] * (ly * ly + lz * lz))
-    return weight
+    return border_profile(dy, zones.half[k, 0], zones.blur[0]) * border_profile(dz, zones.half[k, 1], zones.blur[1])
+
+
+@kernel
+def light_weight(zones, y, z):  # type: ignore[no-untyped-def]
+    """Return the lamp's light in the direction (1, y, z), 1 where it is brightest."""
+    if zones.light[2] <= 0.0:
+        return 1.0
+    ly, lz = y - zones.light[0], z - zones.light[1]
+    return math.exp(-0.5 * zones.light[2] * (ly * ly + lz * lz))
+
+
+@kernel
+def zones_along(zones, axis, cols, place):  # type: ignore[no-untyped-def]
+    """Return the first column (axis 0) or row (axis 1) of zones that may see a tangent, and the one behind the last."""
+    step = 1 if axis == 0 else cols
+    n = cols if axis == 0 else len(zones.centre) // cols
+    first = zones.centre[0, axis]
+    pitch = first - zones.centre[step, axis] if n > 1 else 1.0
+    reach = zones.half[0, axis] + _REACH * zones.blur[axis] + _ALIGNED
+    begin = math.ceil((first - place - reach) / pitch)
+    return max(begin, 0), min(math.floor((first - place + reach) / pitch) + 1, n)
 
 
 @kernel

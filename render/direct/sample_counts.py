@@ -15,14 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.direct.bin_counts import response_share
 from phasemark.render.direct.footprints import (
-    _REACH,
     Footprints,
+    border_weight,
     footprint_areas,
-    footprint_weight,
     footprints_of,
     histogram_of,
+    light_weight,
+    zones_along,
 )
-from phasemark.render.direct.scene_samples import FLOOR, SceneSamples
+from phasemark.render.direct.scene_samples import FLOOR, WALL, SceneSamples
 from phasemark.render.direct.transients import PARTS, through_lens
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
@@ -53,6 +54,7 @@ class _Response(NamedTuple):
 class _Optics(NamedTuple):
     zones: Footprints
     scale: NDArray[np.float64]
+    areas: NDArray[np.float64]
     response: _Response
 
 
@@ -98,19 +100,51 @@ def signal_of_surfaces(samples: SceneSamples, sensor: Sensor, albedo: float = 1.
     return _signals(samples, sensor, np.array([albedo, albedo, 1.0, 1.0]), np.array([0, 0, 1, 2]), 3)
 
 
+def signal_and_shares(
+    samples: SceneSamples, sensor: Sensor, n_bodies: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the expected signal counts without pile-up, and the share of each zone that each body fills.
+
+    Parameters
+    ----------
+    samples : SceneSamples
+        n poses of a scene; amplitudes have albedos in them.
+    sensor : Sensor
+        With a [histogram] table.
+    n_bodies : int
+        What stands behind bodies has higher numbers, and no share.
+
+    Returns
+    -------
+    signal : (n, zones, bins) float64
+    shares : (n, zones, n_bodies) float64
+        Light plays no part in them.
+    """
+    shares = np.zeros((samples.n_views, sensor.rows * sensor.cols, n_bodies))
+    n_parts = n_bodies + FLOOR - WALL + 1
+    signal = _signals(samples, sensor, np.ones(n_parts), np.zeros(n_parts, np.int64), 1, shares)
+    return signal[:, 0], np.minimum(shares, 1.0)
+
+
+_NO_SHARES = np.zeros((0, 0, 0))
+
+
 def _signals(
-    samples: SceneSamples, sensor: Sensor, albedos: NDArray[np.float64], place: NDArray[np.int64], n_places: int
-) -> NDArray[np.float64]:
-    """Return signal counts, the light of each part of the scene times its albedo added to the place of the part."""
+    samples: SceneSamples, sensor: Sensor, albedos: NDArray[np.float64], place: NDArray[np.int64], n_places: int,
+    shares: NDArray[np.float64] = _NO_SHARES,
+) -> NDArray[np.float64]:  # fmt: skip
+    """Return signal counts, the light of each part of the scene times its albedo added to the place of the part.
+
+    What each body fills of each zone is added to `shares`, (n, zones, bodies), if they are asked for.
+    """
     histogram, optics = histogram_of(sensor), _optics_of(sensor)
     n_zones = sensor.rows * sensor.cols
     out = np.zeros((samples.n_views, n_places, n_zones, histogram.bins))
     response = optics.response
     # zones of one response are lit alike by stray light, which is then added to their counts in the end
     alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
-    _add_samples(
-        through_lens(samples, sensor), albedos, place, optics, sensor.cols, 0.0 if alike else histogram.stray, out
-    )
+    stray = 0.0 if alike else histogram.stray
+    _add_samples(through_lens(samples, sensor), albedos, place, optics, sensor.cols, stray, out, shares)
     if alike and histogram.stray > 0:
         out += histogram.stray * out.mean(axis=2, keepdims=True)
     out *= histogram.cycles * histogram.photons
@@ -135,7 +169,8 @@ def _optics_of(sensor: Sensor) -> _Optics:
     offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
     width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale").ravel()
     response = _Response(share, float(low), 1 / step, histogram.start_m - offset, width_m)
-    return _Optics(zones, sensor.zone_values("zone_gain").ravel() / footprint_areas(zones), response)
+    scale = sensor.zone_values("zone_gain").ravel() / footprint_areas(zones)
+    return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
 
 
 @kernel
@@ -169,25 +204,29 @@ def _add_to_bins(light, range_m, response, zone, out):  # type: ignore[no-untype
 
 
 @kernel
-def _add_samples(samples, albedo, place, optics, cols, stray, out):  # type: ignore[no-untyped-def]
-    """Add every sample to the bins of the zones that count its light."""
+def _add_samples(samples, albedo, place, optics, cols, stray, out, shares):  # type: ignore[no-untyped-def]
+    """Add every sample to the bins of the zones that count its light, and its area to the shares of its body."""
     n_zones = out.shape[2]
-    zones, scale, response = optics
+    zones, scale, response = optics.zones, optics.scale, optics.response
     for view in range(len(samples.start) - 1):
         for k in range(samples.start[view], samples.start[view + 1]):
-            y, z = samples.tangents[k, 0], samples.tangents[k, 1]
-            light = samples.amplitude[k] * albedo[samples.part[k]]
-            counts = out[view, place[samples.part[k]]]
+            y, z, part = samples.tangents[k, 0], samples.tangents[k, 1], samples.part[k]
+            light, lit = samples.amplitude[k] * albedo[part], light_weight(zones, y, z)
+            counts = out[view, place[part]]
             total = 0.0
-            for row in range(0, n_zones, cols):
-                if abs(z - zones.centre[row, 1]) > zones.half[row, 1] + _REACH * zones.blur[1]:
-                    continue
-                for q in range(row, row + cols):
-                    w = footprint_weight(zones, q, y, z)
-                    if w != 0.0:
-                        w *= scale[q] * light
-                        total += w
-                        _add_to_bins(w, samples.range_m[k], response, q, counts[q])
+            first_col, stop_col = zones_along(zones, 0, cols, y)
+            first_row, stop_row = zones_along(zones, 1, cols, z)
+            for row in range(first_row, stop_row):
+                for q in range(row * cols + first_col, row * cols + stop_col):
+                    w = border_weight(zones, q, y, z)
+                    if w == 0.0:
+                        continue
+                    if part < shares.shape[2]:
+                        shares[view, q, part] += w * samples.area[k] / optics.areas[q]
+                    w *= lit
+                    w *= scale[q] * light
+                    total += w
+                    _add_to_bins(w, samples.range_m[k], response, q, counts[q])
             if stray > 0.0 and total > 0.0:
                 total *= stray / n_zones
                 for q in range(n_zones):

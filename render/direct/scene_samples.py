@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.area_integral import NO_LEAST, Buffers, camera_poses, find_faces, of_poses, topology_of
+from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, of_poses, topology_of
 from phasemark.render.integral.arguments import Camera, Poses, towards_landmark, towards_level
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.integral.mesh_topology import MeshTopology
-from phasemark.render.integral.quadrature_rules import G2W, G2X, gauss_legendre
+from phasemark.render.integral.quadrature_rules import G2W, G2X, G4W, G4X, gauss_legendre
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.kernel import kernel
@@ -172,43 +172,31 @@ class SceneMesh:
             buffers = idle.pop()
         except IndexError:  # every thread has scratch of its own
             n_edges = len(mesh.creases) + len(mesh.folds)
-            buffers = Buffers(n_edges, (rows, cols), n_samples=_SAMPLES)
+            buffers = Buffers(n_edges, (rows, cols), n_samples=_SAMPLES, keeps_pieces=self._resolves)
         behind = bool(background[:2].any())
         # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
         radians_per_scale = 1.5
         fastest = radians_per_scale / scale[0] if behind else 0.0
-        n = self._planned(NO_LEAST, pose, grid, fastest, state, buffers)
-        if self._resolves:
-            least = np.ones((rows, cols, 2), np.int64)
-            _count_boxes(n, buffers.samples, mesh, pose, grid, scale, least)
-            if (least > 1).any():
-                n = self._planned(least, pose, grid, fastest, state, buffers)
-        samples = buffers.samples
-        more = _count_free(state[0], pose, grid, background, scale) if behind else 0
-        numbers = (np.empty(n + more) for _ in range(3))
-        columns: tuple[NDArray[Any], ...] = np.empty((n + more, 2)), *numbers, np.empty(n + more, np.int32)
-        kept = _hits(n, samples, mesh, pose, grid, background, self._n_parts, columns)
-        idle.append(buffers)
-        if more:
-            kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
-        return tuple(column[:kept] for column in columns)
-
-    def _planned(
-        self, least: NDArray[np.int64], pose: Poses, grid: Camera, fastest: float, state: NDArray[np.uint8],
-        buffers: Buffers,
-    ) -> int:  # fmt: skip
-        """Place the samples of a pose, find what they see, and return how many there are."""
-        mesh = self.topology
         while True:
             reached, n = plan_rays(
-                0, mesh, pose, grid, 1, fastest, least, buffers.edges, buffers.scratch, buffers.samples, state,
-                buffers.borders,
-            )  # fmt: skip
+                0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state, buffers.borders
+            )
             if reached == 1:
                 break
             buffers.make_room(reached)
-        find_faces(n, buffers.samples, state, mesh, self._intersector, pose, grid)
-        return int(n)
+        samples = buffers.samples
+        find_faces(n, samples, state, mesh, self._intersector, pose, grid)
+        counts, corners = np.zeros(samples.pieces.placed[0], np.int64), np.empty((4, 3))
+        more = _count_points(samples, mesh, pose, grid, scale, corners, counts)
+        free = _count_free(state[0], pose, grid, background, scale) if behind else 0
+        room = n + more + free
+        numbers = (np.empty(room) for _ in range(3))
+        columns: tuple[NDArray[Any], ...] = np.empty((room, 2)), *numbers, np.empty(room, np.int32)
+        kept = _hits(n, samples, counts, mesh, pose, grid, background, self._n_parts, scale, corners, columns)
+        idle.append(buffers)
+        if free:
+            kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
+        return tuple(column[:kept] for column in columns)
 
 
 def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float] = (0.0, 0.0)) -> SceneSamples:
@@ -267,59 +255,159 @@ def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[n
 
 
 @kernel
-def _count_boxes(n, samples, mesh, poses, camera, scale, least):  # type: ignore[no-untyped-def]
-    """Raise the boxes of cells along which the range of what is seen changes by more than `scale` asks for.
+def _corners(samples, p, mesh, poses, camera, farthest_m, corners):  # type: ignore[no-untyped-def]
+    """Fill the corners of a piece of a plane, one after the other around it: y, z, and g, what their ranges go with.
 
-    Where the ray (1, y, z) meets a plane, its multiple t changes with y as −t (n · ∂d/∂y) / (n · d).
+    Along the ray d = (1, y, z) the plane n · x = h lies at the range h |d| / (n · d): g = n · d / h is linear in y and
+    z, so that points of one g lie on a line. Returns how long rays are.
     """
-    matrix, lens = poses.matrix[0], poses.lens[0]
-    finest_m, farthest_m = scale
-    for k in range(n):
-        f = samples.face[k]
-        if f < 0 or not mesh.flat[f] or mesh.quadric[f] >= 0:  # round surfaces are at a slant beside their outline only
-            continue
-        y, z = samples.rays[k, 0], samples.rays[k, 1]
-        dx, dy, dz = towards_landmark(matrix, y, z)
-        nx, ny, nz, d = mesh.planes[f, 0], mesh.planes[f, 1], mesh.planes[f, 2], mesh.planes[f, 3]
-        facing = nx * dx + ny * dy + nz * dz
-        if facing == 0.0:
-            continue
-        range_m = abs((d - nx * lens[0] - ny * lens[1] - nz * lens[2]) / facing) * math.sqrt(1.0 + y * y + z * z)
-        if range_m > farthest_m:
-            continue
-        across = abs((nx * matrix[1, 0] + ny * matrix[1, 1] + nz * matrix[1, 2]) / facing) * camera.slope_u
-        down = abs((nx * matrix[2, 0] + ny * matrix[2, 1] + nz * matrix[2, 2]) / facing) * camera.slope_v
-        pixel = samples.pixel[k]
-        row, col = pixel // camera.cols, pixel % camera.cols
-        spread_m = range_m * min(4.0 * samples.weights[k], 1.0)  # a face that fills a cell has four samples there
-        n_u = int(min(math.ceil(spread_m * across / finest_m), _MOST_BOXES))
-        n_v = int(min(math.ceil(spread_m * down / finest_m), _MOST_BOXES))
-        least[row, col, 0], least[row, col, 1] = max(least[row, col, 0], n_u), max(least[row, col, 1], n_v)
+    piece, plane, lens = (
+        samples.pieces.bounds[p],
+        mesh.planes[samples.face[samples.pieces.samples[p, 0]]],
+        poses.lens[0],
+    )
+    height = plane[3] - plane[0] * lens[0] - plane[1] * lens[1] - plane[2] * lens[2]
+    length = 0.0
+    for i in range(4):
+        s, x = piece[0 if i < 2 else 1], piece[(2, 3, 5, 4)[i]]
+        y, z = ray_of(camera, x, s) if samples.pieces.sweep_v[p] else ray_of(camera, s, x)
+        dx, dy, dz = towards_landmark(poses.matrix[0], y, z)
+        own = math.sqrt(1.0 + y * y + z * z)
+        facing = plane[0] * dx + plane[1] * dy + plane[2] * dz
+        corners[i, 0], corners[i, 1] = y, z
+        corners[i, 2] = max(facing / height, own / farthest_m) if height != 0.0 else own / farthest_m
+        length = max(length, own)
+    return length
 
 
 @kernel
-def _hits(n, samples, mesh, poses, camera, background, n_parts, columns):  # type: ignore[no-untyped-def]
+def _count_points(samples, mesh, poses, camera, scale, corners, counts):  # type: ignore[no-untyped-def]
+    """Fill how many points resolve the ranges of each piece at most, 0 where its own do; return how many in all.
+
+    Only pieces of planes are asked: round surfaces are at a slant beside their outline alone.
+    """
+    total = 0
+    for p in range(samples.pieces.placed[0]):
+        first, stop = samples.pieces.samples[p]
+        face = samples.face[first]
+        counts[p] = 0
+        plane = face >= 0 and mesh.flat[face] and mesh.quadric[face] < 0
+        for k in range(first + 1, stop):
+            plane = plane and samples.face[k] == face
+        if not plane:
+            continue
+        far, near, step = _range_steps(samples, p, mesh, poses, camera, scale, corners)
+        if far - near > step:
+            counts[p] = 8 * (math.ceil(0.25 * (far - near) / step) + 3)  # each of three strips may have one part more
+            total += counts[p]
+    return total
+
+
+@kernel
+def _range_steps(samples, p, mesh, poses, camera, scale, corners):  # type: ignore[no-untyped-def]
+    """Fill the corners of a piece; return 1/g of its farthest and nearest, and the step that two points resolve.
+
+    Two points resolve `finest_m` of range, four points four times as much: what they leave of the histogram of a plane
+    is less than 1e-4 of its peak where bins and pulse are twice as long. The error of two points goes with the fourth
+    power of the range, so that of a small piece more may be left.
+    """
+    finest_m, farthest_m = scale
+    first, stop = samples.pieces.samples[p]
+    share = 0.0
+    for k in range(first, stop):
+        share += samples.weights[k]
+    length = _corners(samples, p, mesh, poses, camera, farthest_m, corners)
+    least, most = np.inf, 0.0
+    for i in range(4):
+        least, most = min(least, corners[i, 2]), max(most, corners[i, 2])
+    return 1.0 / least, 1.0 / most, finest_m / length / max(share, 1e-9) ** 0.25
+
+
+@kernel
+def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, corners):  # type: ignore[no-untyped-def]
+    """Write the points that resolve the ranges of a piece; returns the next line.
+
+    Lines of one g cut it into strips at its corners, whose width is linear in g. Gauss lines in a part of a strip
+    resolve its ranges, and two points on each line what else changes.
+    """
+    first, stop = samples.pieces.samples[p]
+    face, whole = samples.face[first], 0.0
+    for k in range(first, stop):
+        whole += samples.weights[k]
+    far, near, step = _range_steps(samples, p, mesh, poses, camera, scale, corners)
+    start, total = kept, 0.0
+    while far > near:
+        nearer = near
+        for i in range(4):
+            if nearer < 1.0 / corners[i, 2] < far:
+                nearer = 1.0 / corners[i, 2]
+        depth = far - nearer
+        few = depth <= step
+        parts = 1 if few else math.ceil(0.25 * depth / step)
+        for part in range(parts):
+            begin, end = 1.0 / (far - part / parts * depth), 1.0 / (far - (part + 1) / parts * depth)
+            for node in range(2 if few else 4):
+                y, z, y_far, z_far = _chord(corners, begin + (G2X[node] if few else G4X[node]) * (end - begin))
+                weight = (G2W[node] if few else G4W[node]) * (end - begin) * math.hypot(y_far - y, z_far - z)
+                total += weight
+                for k in range(2):
+                    own_y, own_z = y + G2X[k] * (y_far - y), z + G2X[k] * (z_far - z)
+                    t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], own_y, own_z)
+                    if t > 0.0:
+                        reflected *= mesh.albedo[face]
+                        kept = _keep(columns, kept, own_y, own_z, t, reflected, G2W[k] * weight, area, mesh.part[face])
+        far = nearer
+    _, _, amplitude, areas, _ = columns
+    for k in range(start, kept):
+        amplitude[k] *= whole / total
+        areas[k] *= whole / total
+    return kept
+
+
+@kernel
+def _chord(corners, g):  # type: ignore[no-untyped-def]
+    """Return both ends, y and z each, of the line across a piece along which g has one value."""
+    y, z, y_far, z_far, found = 0.0, 0.0, 0.0, 0.0, False
+    for i in range(4):
+        j = (i + 1) % 4
+        if (corners[i, 2] <= g) != (corners[j, 2] <= g):
+            along = (g - corners[i, 2]) / (corners[j, 2] - corners[i, 2])
+            y_far = corners[i, 0] + along * (corners[j, 0] - corners[i, 0])
+            z_far = corners[i, 1] + along * (corners[j, 1] - corners[i, 1])
+            if not found:
+                y, z, found = y_far, z_far, True
+    return y, z, y_far, z_far
+
+
+@kernel
+def _hits(n, samples, counts, mesh, poses, camera, background, n_parts, scale, corners, columns):  # type: ignore[no-untyped-def]
     """Fill path length and amplitude of the samples that meet something; returns how many there are."""
-    kept = 0
+    kept, k, p = 0, 0, 0
     area = 1.0 / (camera.scale_u * camera.scale_v)
     behind = background[0] > 0.0 or background[1] > 0.0
     cos_b, sin_b = math.cos(poses.bearing[0]), math.sin(poses.bearing[0])
-    for k in range(n):
+    while k < n:
+        if p < len(counts) and samples.pieces.samples[p, 0] == k:
+            p += 1
+            if counts[p - 1] > 0:
+                kept = _keep_piece(columns, kept, p - 1, samples, mesh, poses, camera, area, scale, corners)
+                k = samples.pieces.samples[p - 1, 1]
+                continue
         face = samples.face[k]
-        if face < 0 and not behind:
-            continue
         y, z = samples.rays[k, 0], samples.rays[k, 1]
+        t, reflected, seen = 0.0, 0.0, 0
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
             reflected *= mesh.albedo[face]
             seen = mesh.part[face]
-        else:
+        elif behind:
             dx, dy, dz = towards_level(poses.level[0], y, z)
             t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
             reflected = rho * facing
             seen = n_parts - 1 + nearer_plane(background, cos_b, sin_b, dx, dy, dz)  # planes are numbered from 1
         if t > 0.0:
             kept = _keep(columns, kept, y, z, t, reflected, samples.weights[k], area, seen)
+        k += 1
     return kept
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.direct.footprints import (
-    _REACH,
     Footprints,
     footprint_areas,
     footprint_weight,
@@ -121,38 +120,3 @@ def _add_samples(samples, zones, scale, axis, out):  # type: ignore[no-untyped-d
                 row[i] += w * b
                 row[i + 1] += w * c
                 row[i + 2] += w * d
-
-
-def zone_shares(samples: SceneSamples, sensor: Sensor, n_parts: int) -> NDArray[np.float64]:
-    """Return the share of each zone's footprint that each part fills, (n, zones, n_parts); light plays no part.
-
-    Parameters
-    ----------
-    samples : SceneSamples
-        n poses.
-    sensor : Sensor
-    n_parts : int
-        Parts of the mesh or bodies of the scene; what stands behind is left out.
-    """
-    zones = footprints_of(sensor)
-    zones = zones._replace(light=np.zeros(3))
-    out = np.zeros((samples.n_views, len(zones.centre), n_parts))
-    _add_shares(samples, zones, 1 / footprint_areas(zones), sensor.cols, out)
-    return np.minimum(out, 1.0)
-
-
-@kernel
-def _add_shares(samples, zones, scale, cols, out):  # type: ignore[no-untyped-def]
-    """Add the area of every sample to the zones that see it."""
-    for view in range(len(samples.start) - 1):
-        for k in range(samples.start[view], samples.start[view + 1]):
-            if samples.part[k] >= out.shape[2]:
-                continue
-            y, z = samples.tangents[k, 0], samples.tangents[k, 1]
-            for row in range(0, out.shape[1], cols):
-                if abs(z - zones.centre[row, 1]) > zones.half[row, 1] + _REACH * zones.blur[1]:
-                    continue
-                for q in range(row, row + cols):
-                    w = footprint_weight(zones, q, y, z)
-                    if w != 0.0:
-                        out[view, q, samples.part[k]] += w * samples.area[k] * scale[q]

@@ -13,7 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.integral.arguments import Borders, Camera, Edges, Light, Motion, Poses, Returns, Samples, Sums
+from phasemark.render.integral.arguments import (
+    Borders,
+    Camera,
+    Edges,
+    Light,
+    Motion,
+    Pieces,
+    Poses,
+    Returns,
+    Samples,
+    Sums,
+)
 from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import Intersector
 from phasemark.render.integral.lens_tables import distortion_of
@@ -41,10 +52,6 @@ _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
 
 
-NO_LEAST = np.empty((0, 0, 2), np.int64)
-"""No pixel asks for more boxes than all."""
-
-
 @dataclass
 class Buffers:
     """Scratch of one thread; grows when a view needs more."""
@@ -55,6 +62,7 @@ class Buffers:
     n_links: int = 1 << 14
     n_borders: int = 0
     n_parameters: int = 0
+    keeps_pieces: bool = False
 
     def __post_init__(self) -> None:
         rows, cols = self.shape
@@ -71,7 +79,7 @@ class Buffers:
             extent=np.empty((2, 4)),
             line=np.empty(4),
         )
-        self.samples = _room_for(self.n_samples)
+        self.samples = _room_for(self.n_samples, self.keeps_pieces)
         self.borders = _room_for_borders(self.n_borders, self.n_parameters)
 
     def make_room(self, reached: int) -> None:
@@ -94,11 +102,11 @@ class Buffers:
         self.edges = self.edges._replace(link=np.empty(n, np.int32), owner=np.empty(n, np.int32))
 
     def _grow_samples(self) -> None:
-        self.samples = _room_for(2 * len(self.samples.weights))
+        self.samples = _room_for(2 * len(self.samples.weights), self.keeps_pieces)
         self.borders = _room_for_borders(2 * len(self.borders.weights), self.n_parameters)
 
 
-def _room_for(n: int) -> Samples:
+def _room_for(n: int, keeps_pieces: bool = False) -> Samples:
     return Samples(
         points=np.empty((n, 2)),
         rays=np.empty((n, 2)),
@@ -110,6 +118,7 @@ def _room_for(n: int) -> Samples:
         origins=np.empty((n, 3), np.float32),
         directions=np.empty((n, 3), np.float32),
         returns=Returns.empty(_RETURNS),
+        pieces=Pieces.empty(n if keeps_pieces else 0),
     )
 
 
@@ -268,8 +277,8 @@ class AreaIntegral:
             view = 0
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.fastest, NO_LEAST, buffers.edges,
-                    buffers.scratch, buffers.samples, own.state, buffers.borders,
+                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges, buffers.scratch,
+                    buffers.samples, own.state, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)

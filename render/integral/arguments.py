@@ -258,6 +258,33 @@ class Returns(NamedTuple):
         return cls(*np.empty((4, m)))
 
 
+class Pieces(NamedTuple):
+    """Parts of pixels whose samples follow one another, in their order; room for m, or for none if nobody asks.
+
+    Parameters
+    ----------
+    samples : (m, 2) int64
+        The first sample, and the one behind the last.
+    bounds : (m, 6) float64
+        First and last line of the sweep, the ends of the piece on the first, and on the last: a trapezoid, or close to
+        it where its sides are curves.
+    sweep_v : (m,) bool
+        Whether lines lie at v, from u to u, or at u.
+    placed : (1,) int64
+        How many there are.
+    """
+
+    samples: NDArray[np.int64]
+    bounds: NDArray[np.float64]
+    sweep_v: NDArray[np.bool_]
+    placed: NDArray[np.int64]
+
+    @classmethod
+    def empty(cls, m: int) -> Pieces:
+        """Return room for m pieces."""
+        return cls(np.empty((m, 2), np.int64), np.empty((m, 6)), np.empty(m, np.bool_), np.zeros(1, np.int64))
+
+
 class Samples(NamedTuple):
     """Samples of some views; room for m.
 
@@ -281,6 +308,8 @@ class Samples(NamedTuple):
         These rays, landmark frame.
     returns : Returns
         Of fewer than m samples at a time.
+    pieces : Pieces
+        That these samples stand for.
     """
 
     points: NDArray[np.float64]
@@ -293,6 +322,7 @@ class Samples(NamedTuple):
     origins: NDArray[np.float32]
     directions: NDArray[np.float32]
     returns: Returns
+    pieces: Pieces
 
 
 class Sums(NamedTuple):

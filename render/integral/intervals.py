@@ -95,6 +95,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
             lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
             hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
             nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch)
+            first, a_first, b_first = n, 0.0, 0.0
             for g in range(nodes):
                 s = s_a if g == 0 else s_b
                 weight = area * (share if g == 0 else 1.0 - share)
@@ -109,11 +110,31 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
                     points[j, 0] = x if box.sweep_v else s
                     points[j, 1] = s if box.sweep_v else x
                 n += placed
+                if g == 0:
+                    a_first, b_first = a, b
+            if n > first and len(samples.pieces.samples) > 0:
+                rise = (
+                    1.0 / (s_b - s_a) if nodes == 2 else 0.0
+                )  # of the ends, from the lines of the nodes to the others
+                rise_a, rise_b = (a - a_first) * rise, (b - b_first) * rise
+                ends = a_first + (lo - s_a) * rise_a, b_first + (lo - s_a) * rise_b
+                far_ends = a_first + (hi - s_a) * rise_a, b_first + (hi - s_a) * rise_b
+                add_piece(samples.pieces, first, n, box.sweep_v, (lo, hi, *ends, *far_ends))
         scratch.found[i] = region if n > before else -1
         region += n > before
     if len(borders.weights) > 0:
         place_borders(strip, box, scratch, borders)
     return n, region
+
+
+@kernel
+def add_piece(pieces, first, stop, sweep_v, bounds):  # type: ignore[no-untyped-def]
+    """Append a piece; there are no more of them than samples."""
+    p = pieces.placed[0]
+    pieces.samples[p, 0], pieces.samples[p, 1], pieces.sweep_v[p] = first, stop, sweep_v
+    for k in range(6):
+        pieces.bounds[p, k] = bounds[k]
+    pieces.placed[0] = p + 1
 
 
 @kernel

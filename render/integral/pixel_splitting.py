@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.integral.edges_in_pixels import MAX_SEGMENTS, clip, clip_to_box
-from phasemark.render.integral.intervals import Box
+from phasemark.render.integral.intervals import Box, add_piece
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
 from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, find_events, sweep_box
@@ -149,6 +149,10 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
                     regions[n] = region
                     n += 1
             region += 1
+            if len(samples.pieces.samples) > 0:
+                left, top = u0 + width / splits_u * col, v0 + height / splits_v * row
+                right, bottom = left + width / splits_u, top + height / splits_v
+                add_piece(samples.pieces, n - count * count, n, True, (top, bottom, left, right, left, right))
         return n, region, True
     # sweep along the limb if there is one, else along where one is near, else along most of the edges
     crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0

@@ -35,7 +35,7 @@ SHORT_SEGMENTS = -2
 
 @kernel
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, poses, camera, splits, fastest, least, edges, scratch, samples, state, borders
+    first, mesh, poses, camera, splits, fastest, edges, scratch, samples, state, borders
 ):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -49,12 +49,10 @@ def plan_rays(  # type: ignore[no-untyped-def]
         Boxes a side that every pixel is cut into, at least.
     fastest : float
         As :class:`~phasemark.render.integral.arguments.Light` has it.
-    least : (rows, cols, 2) int64
-        Boxes along u and v that each pixel is cut into, at least; without rows: `splits` alone counts.
     edges : Edges
     scratch : Scratch
     samples : Samples
-        ``points``, ``rays``, ``weights``, ``regions`` and ``pixel`` are overwritten.
+        ``points``, ``rays``, ``weights``, ``regions``, ``pixel`` and ``pieces`` are overwritten.
     state : (n, rows, cols) uint8, overwritten
         Per pixel :data:`SKIPPED`, :data:`SPLIT` or :data:`UNTRUSTED`.
     borders : Borders
@@ -69,7 +67,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     head, reach, bent_lens = edges.head, camera.distortion.reach, camera.distortion.model != 0
     rows, cols = camera.stop_row - camera.first_row, camera.cols
     n, region, n_borders, room = np.int64(0), np.int64(0), np.int64(0), len(borders.weights)
-    borders.placed[0] = 0
+    borders.placed[0] = samples.pieces.placed[0] = 0
     for view in range(first, len(poses.lens)):
         n_edges = project_edges(mesh, poses, view, camera, edges)
         if n_edges < 0:
@@ -118,8 +116,6 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 if turn > 0.5 * _TURN_RAD and (near_limb or head[r + 1, c + 1] >= 0):
                     parts_u, parts_v = max(parts_u, 2), max(parts_v, 2)
                 parts_u, parts_v = max(least_parts, parts_u), max(least_parts, parts_v)
-                if len(least) > 0:
-                    parts_u, parts_v = max(parts_u, least[row, c, 0]), max(parts_v, least[row, c, 1])
                 n, region, trusted = sample_pixel(
                     r, c, bent, parts_u, parts_v, camera, edges, scratch, samples, borders, n, region
                 )

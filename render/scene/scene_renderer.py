@@ -11,11 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background, parameters_of_views
 from phasemark.render.direct.bin_counts import detected_counts
-from phasemark.render.direct.footprints import footprint_grid, histogram_of
+from phasemark.render.direct.footprints import footprint_grid, histogram_of, zones_tile
 from phasemark.render.direct.histogram_images import HistogramImages
-from phasemark.render.direct.sample_counts import signal_of_samples
+from phasemark.render.direct.sample_counts import signal_and_shares
 from phasemark.render.direct.scene_samples import SceneMesh
-from phasemark.render.direct.transients import zone_shares
 from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
 from phasemark.render.integral.arguments import Poses
 from phasemark.render.integral.ray_plan import UNTRUSTED
@@ -155,7 +154,9 @@ class SceneRenderer:
     ) -> HistogramImages:
         """Render the histograms of frames with a direct sensor; see :meth:`render`."""
         n, b = self._counts(camera2world)
-        sensor, histogram, grid = self.sensor, histogram_of(self.sensor), footprint_grid(self.sensor)
+        sensor, histogram = self.sensor, histogram_of(self.sensor)
+        few = 2  # cells a side of a zone: pieces of faces in them resolve ranges, so that 3e-4 of a peak needs no more
+        grid = footprint_grid(sensor, cells=few if zones_tile(sensor) else None)
         finest_m, farthest_m = 0.5 * histogram.bin_width_m, histogram.start_m + 1.1 * histogram.length_m
         zones = sensor.rows * sensor.cols
         signal = np.zeros((n, zones, histogram.bins))
@@ -166,9 +167,7 @@ class SceneRenderer:
 
             def run(k: int) -> None:
                 samples = surface.samples_of_poses(of_poses(poses, slice(k, k + 1)), grid, finest_m, farthest_m)
-                shares[which[k]] = zone_shares(samples, sensor, b)[0]
-                samples = samples._replace(part=np.zeros_like(samples.part))
-                signal[which[k]] = signal_of_samples(samples, sensor, 1.0)[0]
+                (signal[which[k]],), (shares[which[k]],) = signal_and_shares(samples, sensor, b)
 
             mapped(run, range(len(which)), threads)
 
