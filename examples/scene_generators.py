@@ -1,4 +1,4 @@
-"""Three generators of scenes: a dock with clutter, people under a ceiling, postures of a hand; build a set of one.
+"""Generators of scenes: a dock with clutter, people under a ceiling, postures of a hand; build a set of one.
 
 ``python examples/scene_generators.py people --scenes 100 --out people.h5``
 
@@ -10,6 +10,7 @@ differ from scene to scene, so that every scene can be made again from its numbe
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import math
 import sys
 from functools import lru_cache
@@ -51,7 +52,7 @@ CLUTTER = (
 def dock(index: int, rng: np.random.Generator, steps: int = 1, speed_m: float = 0.02) -> GeneratedScene:
     """Return a dock that the camera drives at among clutter, before a wall; in every tenth scene there is none.
 
-    Labels are D and δ of each step (PHYSICS section 1), NaN without a dock.
+    Labels are D, δ and bearing of each step (PHYSICS section 1), NaN without a dock.
     """
     there = rng.random() >= 0.1
     distance_m = rng.uniform(0.9, 1.6) - speed_m * np.arange(steps)
@@ -71,6 +72,7 @@ def dock(index: int, rng: np.random.Generator, steps: int = 1, speed_m: float = 
         {
             "distance_m": distance_m if there else math.nan,
             "delta_rad": delta_rad if there else math.nan,
+            "bearing_rad": bearing_rad if there else math.nan,
             "there": float(there),
         },
         {body.name: poses.get(body.name, np.eye(4)) for body in bodies},
@@ -131,8 +133,7 @@ HAND = Scene([Body(mesh, albedo=0.6, name=f"hand {k}") for k, mesh in enumerate(
 def hand(index: int, rng: np.random.Generator) -> GeneratedScene:
     """Return a hand that turns its palm to the sensor at 15 to 35 cm; in every tenth scene there is none."""
     posture = str(rng.choice(list(POSTURES)))
-    wrist = placed(rng.uniform(0.15, 0.35), *rng.uniform(-0.02, 0.02, 2))
-    wrist = wrist @ trimesh.transformations.euler_matrix(*rng.normal(0, math.radians(12), 3))
+    wrist = before_sensor(rng)
     poses = [wrist]
     for finger, bent in enumerate(POSTURES[posture]):
         thumb = finger == 0
@@ -149,10 +150,63 @@ def hand(index: int, rng: np.random.Generator) -> GeneratedScene:
     return GeneratedScene(HAND, np.eye(4), {"posture": posture}, np.array(poses), Background(wall_m=1.5))
 
 
+def before_sensor(rng: np.random.Generator) -> Pose:
+    """Return where a hand is that turns its palm to the sensor: x away from it, z to the tips of the fingers."""
+    pose = placed(rng.uniform(0.15, 0.35), *rng.uniform(-0.02, 0.02, 2))
+    return pose @ np.asarray(trimesh.transformations.euler_matrix(*rng.normal(0, math.radians(12), 3)))
+
+
 def turned(axis: str, angle_rad: float) -> Pose:
     """Return a rotation about an axis."""
     way = {"x": (1, 0, 0), "y": (0, 1, 0)}[axis]
     return np.asarray(trimesh.transformations.rotation_matrix(angle_rad, way))
+
+
+# --- the same with meshes: the Shadow hand of gymnasium-robotics -----------------------------------------------------
+
+SHADOW_FINGERS = ("TH", "FF", "MF", "RF", "LF")
+SHADOW_FINGER = {"J2": (0.1, 1.3), "J1": (0.1, 1.3), "J0": (0.1, 1.0)}
+SHADOW_THUMB = {"J4": (0.0, 1.0), "J3": (0.0, 0.9), "J1": (0.0, -0.4), "J0": (-0.1, -1.0)}
+"""Angles of joints of a straight and of a bent finger, radians."""
+SHADOW_CENTRE = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.05], [0.0, 0.0, 0.0, 1.0]])
+"""Middle of the palm in the model's palm: x out of the back of the hand, y to the thumb's other side, z to the tips."""
+
+
+@lru_cache
+def shadow() -> tuple[Any, Any, Scene]:
+    """Return the model without its forearm, as MuJoCo has it and as a scene; it is read once."""
+    package = importlib.util.find_spec("gymnasium_robotics")
+    if package is None or package.origin is None:
+        raise UsageError("the Shadow hand needs the packages mujoco and gymnasium-robotics: pip install both")
+    import mujoco
+
+    from phasemark.render.simulators.mujoco_scene import seen_model
+
+    model = mujoco.MjModel.from_xml_path(str(Path(package.origin).parent / "envs" / "assets" / "hand" / "reach.xml"))
+    seen = seen_model(model, 0.6, model.body("robot0:forearm").id, (1,), smooth=True)
+    return model, seen, Scene([body.named(f"hand {k}") for k, body in enumerate(seen.scene)])
+
+
+def shadow_hand(index: int, rng: np.random.Generator) -> GeneratedScene:
+    """Return a robot's hand before the sensor as `hand` does; the camera moves, and the palm stays where it is."""
+    model, seen, scene = shadow()
+    import mujoco
+
+    posture = str(rng.choice(list(POSTURES)))
+    data = mujoco.MjData(model)
+    for finger, bent in zip(SHADOW_FINGERS, POSTURES[posture], strict=True):
+        for name, angles in (SHADOW_THUMB if finger == "TH" else SHADOW_FINGER).items():
+            joint = f"robot0:{finger}{name}"
+            angle = angles[bent] + rng.normal(0, 0.08)
+            data.joint(joint).qpos[0] = np.clip(angle, *model.joint(joint).range)
+    mujoco.mj_kinematics(model, data)
+    palm = np.eye(4)
+    palm[:3, :3], palm[:3, 3] = data.body("robot0:palm").xmat.reshape(3, 3), data.body("robot0:palm").xpos
+    camera = palm @ SHADOW_CENTRE @ np.linalg.inv(before_sensor(rng))
+    if rng.random() < 0.1:
+        return GeneratedScene(None, camera, {"posture": "none"}, background=Background(wall_m=1.5))
+    poses = seen.poses(data, camera[:3, 3])
+    return GeneratedScene(scene, camera, {"posture": posture}, poses, Background(wall_m=1.5))
 
 
 PLANS: dict[str, dict[str, Any]] = {
@@ -162,8 +216,9 @@ PLANS: dict[str, dict[str, Any]] = {
         "scenes": {"classes": ["floor", "person"], "bodies": 5},
     },
     "hand": {"sensor": "vl53l8cx-8x8", "scenes": {"classes": ["hand"], "bodies": 15}},
+    "shadow_hand": {"sensor": "vl53l8cx-8x8", "scenes": {"classes": ["hand"], "bodies": 24}},
 }  # fmt: skip
-"""Plans of the three, without the number of scenes."""
+"""Plans of all, without the number of scenes."""
 
 
 def main() -> int:

@@ -9,6 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from phasemark import UsageError
 from phasemark.data import build_frames
 from phasemark.data.plans import SceneFramesPlan
 from phasemark.data.seeds import stream
@@ -96,6 +97,34 @@ def test_bent_fingers_are_nearer_to_the_sensor(generators: ModuleType) -> None:
         assert (tip[1:, 2][bent[1:]] < 0.0).all()
         assert (tip[1:, 2][~bent[1:]] > 0.4).all()
     assert seen == {*generators.POSTURES, "none"}
+
+
+def test_bent_fingers_of_the_shadow_hand_are_nearer_to_the_sensor(generators: ModuleType, tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    pytest.importorskip("gymnasium_robotics")
+    of_name = {name: k for k, name in enumerate(generators.shadow()[1].scene.names)}
+    seen = set()
+    for index in range(20):
+        made = generators.shadow_hand(index, stream(7, "scenes", index))
+        seen.add(made.labels["posture"])
+        if made.scene is None:
+            continue
+        middles = (np.linalg.inv(made.camera2world) @ made.bodies2world)[:, :3, 3]
+        bent_fingers = generators.POSTURES[made.labels["posture"]][1:]
+        for finger, bent in zip(generators.SHADOW_FINGERS[1:], bent_fingers, strict=True):
+            knuckle, tip = (middles[of_name[f"robot0:{finger.lower()}{bone}"]] for bone in ("knuckle", "distal"))
+            # 45 and 25 mm of bones lie between them, and half of the last; a hand that leans by 25° takes 35 mm of it
+            assert (np.linalg.norm(tip - knuckle) > 0.075) != bent
+            assert tip[0] < knuckle[0] - 0.02 or not bent
+    assert seen == {*generators.POSTURES, "none"}
+    with build_frames(plan_of(generators, "shadow_hand", 2), tmp_path / "hand.h5", workers=1) as frames:
+        assert frames[:]["shares"].sum() > 2 * 8  # of 64 zones each
+
+
+def test_a_hand_that_is_not_installed_is_named(generators: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generators.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(UsageError, match="needs the packages mujoco and gymnasium-robotics: pip install both"):
+        generators.shadow.__wrapped__()
 
 
 def test_the_bytes_of_a_hand_do_not_depend_on_workers(generators: ModuleType, tmp_path: Path) -> None:
