@@ -27,9 +27,9 @@ _FOLDERS = {
     "render/exposure": "capture photoelectrons random_streams taps",
     "render/scene": "assembly crossings depth_slopes",
     "render/integral": (
-        "arguments bent_edges borders circular components edge_motion edge_projection edges_in_pixels"
+        "arguments bent_edges borders circular components convex_parts edge_motion edge_projection edges_in_pixels"
         " face_search floor_phase image_rays intersect intervals light limbs mesh_topology pixel_splitting"
-        " quadrature_rules ray_plan strips swept_light visible_faces"
+        " quadrature_rules ray_plan round_edges strips swept_light visible_faces"
     ),
 }
 COMPILED_SOURCES = tuple(f"{folder}/{name}.py" for folder, names in _FOLDERS.items() for name in names.split())

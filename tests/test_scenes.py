@@ -180,6 +180,36 @@ def test_the_mesh_of_a_ball_that_was_stretched_is_no_ball_any_more():
     np.testing.assert_allclose(stretched.phasor, true.phasor, atol=2e-3 * np.abs(true.phasor).max())
 
 
+@pytest.mark.parametrize("distance_m", [0.3, 0.5, 1.5])
+def test_a_sphere_fills_the_share_of_its_cone(distance_m):
+    """Seen on the axis, a sphere's outline is a circle of tangents, of radius tan(arcsin(R / d))."""
+    one = WIDE.with_(rows=1, cols=1)
+    image = SceneRenderer(Scene([Body.sphere(0.1, pose=placed((distance_m, 0, 0)))]), one).phasors(np.eye(4))
+    tangent = math.tan(math.asin(0.1 / distance_m)) / math.tan(math.radians(22.5))
+    assert image.shares is not None
+    assert image.shares[0, 0, 0, 0] == pytest.approx(math.pi / 4 * tangent**2, abs=3e-5)
+
+
+@pytest.mark.parametrize("shape", ["box", "sphere", "capsule"])
+def test_a_body_hidden_by_another_leaves_no_trace(shape):
+    hidden = {"box": Body.box((0.1, 0.1, 0.1)), "sphere": Body.sphere(0.07), "capsule": Body.capsule(0.05, 0.1)}[shape]
+    cover = Body.box((0.05, 0.6, 0.6), pose=placed((0.8, 0, 0)))
+    renderer = SceneRenderer(Scene([cover, replace(hidden, pose=placed((1.5, 0.05, 0.03)))]), WIDE)
+    alone = SceneRenderer(Scene([cover]), WIDE).phasors(np.eye(4))
+    np.testing.assert_array_equal(renderer.phasors(np.eye(4)).phasor, alone.phasor)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_cylinders_and_ellipsoids_are_what_their_fine_meshes_are(axis):
+    """The facets of a mesh are 4° wide."""
+    turned = np.eye(4)[:, [axis, (axis + 1) % 3, (axis + 2) % 3, 3]]
+    turned[:3, 3] = 1.0, 0.1, 0.05
+    for body in (Body.cylinder(0.12, 0.3, pose=turned), Body.ellipsoid((0.1, 0.2, 0.15), pose=turned)):
+        exact = SceneRenderer(Scene([body]), WIDE).phasors(np.eye(4))
+        facets = SceneRenderer(Scene([replace(body, primitive=None)]), WIDE).phasors(np.eye(4))
+        np.testing.assert_allclose(exact.phasor, facets.phasor, atol=2e-3 * np.abs(exact.phasor).max())
+
+
 def test_both_intersectors_see_the_same_scene():
     scene = Scene(body_of(solid) for solid in random_solids(np.random.default_rng(8), 8))
     camera = placed((-0.4, 0.1, 0.5))

@@ -75,6 +75,8 @@ class Buffers:
             link=np.empty(self.n_links, np.int32),
             owner=np.empty(self.n_links, np.int32),
             heights=np.empty(CLUSTER),
+            arc=np.empty((3, 3)),
+            points=np.empty((2, 3)),
             ends=np.empty((self.n_segments, 2), np.int32),
             extent=np.empty((2, 4)),
             line=np.empty(4),
@@ -344,9 +346,9 @@ _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 def mesh_digest(mesh: SurfaceMesh) -> bytes:
     """Return a digest of all that a renderer asks of a mesh."""
-    attributes = [mesh.face_attributes.get(name, ()) for name in ("part", "albedo", "quadric")]
+    attributes = [mesh.face_attributes.get(name, ()) for name in ("part", "albedo")]
     digest = hashlib.blake2b()
-    for array in (mesh.vertices, mesh.faces, *attributes, mesh.metadata.get("quadrics", ())):
+    for array in (mesh.vertices, mesh.faces, *attributes):
         values = np.ascontiguousarray(array)
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(values.tobytes())

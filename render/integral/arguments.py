@@ -158,6 +158,8 @@ class Edges(NamedTuple):
         With distortion: lowest and highest y, lowest and highest z of all edges, and of the limbs among them.
     line : (4,) float64
         Scratch: an edge in tangents.
+    arc, points : (3, 3), (2, 3) float64
+        Scratch: the ellipse of a round edge, and the ends of a segment of it.
     """
 
     segments: NDArray[np.float64]
@@ -169,6 +171,8 @@ class Edges(NamedTuple):
     ends: NDArray[np.int32]
     extent: NDArray[np.float64]
     line: NDArray[np.float64]
+    arc: NDArray[np.float64]
+    points: NDArray[np.float64]
 
 
 class Borders(NamedTuple):

@@ -16,6 +16,8 @@ import math
 import numpy as np
 
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
+from phasemark.render.integral.convex_parts import is_hidden
+from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, segments_of
 from phasemark.render.kernel import kernel
 
 
@@ -42,7 +44,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     int
         How many segments were written, or :data:`~phasemark.render.integral.bent_edges.FULL`.
     """
-    vertices, planes, creases, concave, folds = mesh.vertices, mesh.planes, mesh.creases, mesh.concave, mesh.folds
+    vertices, creases, concave, folds = mesh.vertices, mesh.creases, mesh.concave, mesh.folds
     smooth_planes, clusters = mesh.smooth_planes, mesh.clusters
     lens, matrix, offset = poses.lens[view], poses.matrix[view], poses.offset[view]
     n, crease, limb = np.int64(0), np.int64(0), np.int64(1)
@@ -51,9 +53,13 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
         # a closed shell hides what turns its back, and a valley from everywhere but between its slopes
         if mesh.closed[face]:
-            before, before_other = _height(planes, face, lens) > 0.0, _height(planes, other, lens) > 0.0
+            before = _is_before(mesh, face, start, lens) or _is_before(mesh, face, end, lens)
+            before_other = _is_before(mesh, other, start, lens) or _is_before(mesh, other, end, lens)
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
+        body, beside = mesh.part[face], mesh.part[other if other >= 0 else face]
+        if len(mesh.parts) > 0 and is_hidden(mesh, lens, vertices[start], vertices[end], body, beside):
+            continue
         n = _add_edge(vertices, start, end, crease, matrix, offset, camera, edges, n)
         if n < 0:
             return FULL
@@ -79,6 +85,90 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 n = _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n)
                 if n < 0:
                     return FULL
+    for c in range(len(mesh.curves)):
+        n = _add_curve(mesh, mesh.curves[c], lens, matrix, offset, camera, edges, n)
+        if n < 0:
+            return FULL
+    return n
+
+
+@kernel
+def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+    """Append what is seen of a round edge; return how many segments there are, or :data:`FULL`."""
+    arc = edges.arc
+    begin, end = arc_of(curve, lens, arc)
+    if begin == end:
+        return n
+    if curve[0] == TUBE:
+        for angle in (begin, end):
+            for k in range(3):
+                across = math.cos(angle) * arc[1, k] + math.sin(angle) * arc[2, k]
+                edges.points[0, k] = arc[0, k] + across - curve[10 + k]
+                edges.points[1, k] = arc[0, k] + across + curve[10 + k]
+            left = _turns_left(edges.points, arc, lens)
+            n = _add_segment(mesh, lens, curve[13], np.int64(1), left, matrix, offset, camera, edges, n)
+            if n < 0:
+                return FULL
+        return n
+    n = _add_arc(mesh, begin, end, curve[13], curve[0] >= BALL, lens, matrix, offset, camera, edges, n)
+    whole = 2.0 * math.pi
+    if curve[0] == RIM and n >= 0 and end - begin < whole and before_rim(curve, lens):
+        n = _add_arc(mesh, end, begin + whole, curve[13], False, lens, matrix, offset, camera, edges, n)
+    return n
+
+
+@kernel
+def _add_arc(mesh, begin, end, body, is_limb, lens, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+    """Append an arc of the ellipse at hand as a chain that has its area and its ends."""
+    arc, points = edges.arc, edges.points
+    away, first, second = 0.0, 0.0, 0.0
+    for k in range(3):
+        away += (arc[0, k] - lens[k]) ** 2
+        first, second = first + arc[1, k] ** 2, second + arc[2, k] ** 2
+    size = math.sqrt(max(first, second))
+    count = segments_of(end - begin, camera.scale_u * size / max(math.sqrt(away) - size, 1e-3 * size))
+    step = (end - begin) / count
+    whole = end - begin >= 2.0 * math.pi
+    stretch = math.sqrt(step / math.sin(step)) if step < 1.0 else 1.0
+    left = False
+    for i in range(count + 1):
+        angle = begin + i * step
+        own = stretch if whole or 0 < i < count else 1.0
+        for k in range(3):
+            points[0, k] = points[1, k]
+            points[1, k] = arc[0, k] + own * (math.cos(angle) * arc[1, k] + math.sin(angle) * arc[2, k])
+        if i == 0:
+            continue
+        if i == 1:
+            left = _turns_left(points, arc, lens)
+        n = _add_segment(mesh, lens, body, np.int64(is_limb), left, matrix, offset, camera, edges, n)
+        if n < 0:
+            return FULL
+    return n
+
+
+@kernel
+def _turns_left(points, arc, lens):  # type: ignore[no-untyped-def]
+    """Return whether the centre of an ellipse lies on the left of the way from one point to the other, as seen."""
+    ax, ay, az = points[0, 0] - lens[0], points[0, 1] - lens[1], points[0, 2] - lens[2]
+    bx, by, bz = points[1, 0] - lens[0], points[1, 1] - lens[1], points[1, 2] - lens[2]
+    cx, cy, cz = arc[0, 0] - lens[0], arc[0, 1] - lens[1], arc[0, 2] - lens[2]
+    return (ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz > 0.0
+
+
+@kernel
+def _add_segment(mesh, lens, body, limb, left, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+    """Append a segment of a round edge, whose surface is on its left or on its right."""
+    if is_hidden(mesh, lens, edges.points[0], edges.points[1], body, body):
+        return n
+    spare = 2  # for the background, and for one more
+    if n + spare > len(edges.segments):
+        return FULL
+    a, b = (np.int64(1), np.int64(0)) if left else (np.int64(0), np.int64(1))
+    before = n
+    n = _add_edge(edges.points, a, b, limb, matrix, offset, camera, edges, n)
+    for k in range(before, n):
+        edges.ends[k, 0] = -1
     return n
 
 
@@ -97,9 +187,16 @@ def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: 
 
 
 @kernel
-def _height(planes, f, lens):  # type: ignore[no-untyped-def]
-    """Return how far before the front of a face the lens is."""
-    return planes[f, 0] * lens[0] + planes[f, 1] * lens[1] + planes[f, 2] * lens[2] - planes[f, 3]
+def _is_before(mesh, f, vertex, lens):  # type: ignore[no-untyped-def]
+    """Return whether the lens is before the front of a face, a round one at the vertex."""
+    planes, x, y, z = mesh.planes, lens[0], lens[1], lens[2]
+    if mesh.quadric[f] < 0:
+        return planes[f, 0] * x + planes[f, 1] * y + planes[f, 2] * z - planes[f, 3] > 0.0
+    q, p = mesh.quadrics[mesh.quadric[f]], mesh.vertices[vertex]
+    nx = q[0] * p[0] + q[3] * p[1] + q[4] * p[2] + q[6]
+    ny = q[3] * p[0] + q[1] * p[1] + q[5] * p[2] + q[7]
+    nz = q[4] * p[0] + q[5] * p[1] + q[2] * p[2] + q[8]
+    return nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2]) > 0.0
 
 
 @kernel

@@ -137,11 +137,11 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
 
 @kernel
 def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return the multiple of the ray at its hit with the face's quadric, and |cos θ| there times the ray's length.
+    """Return the multiple of the ray where it enters the face's quadric, and |cos θ| there times the ray's length.
 
-    Facets reach a little beyond the outline of the quadric; a ray that misses it there grazes it.
+    An outline is a chain of segments, some of which lie a hair outside: a ray that misses the quadric grazes it.
     """
-    q, own = mesh.quadrics[mesh.quadric[f]], mesh.planes[f]
+    q = mesh.quadrics[mesh.quadric[f]]
     gx = q[0] * dx + q[3] * dy + q[4] * dz
     gy = q[3] * dx + q[1] * dy + q[5] * dz
     gz = q[4] * dx + q[5] * dy + q[2] * dz
@@ -151,14 +151,11 @@ def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
     a, b = dx * gx + dy * gy + dz * gz, dx * hx + dy * hy + dz * hz
     c = ox * (hx + q[6]) + oy * (hy + q[7]) + oz * (hz + q[8]) + q[9]
     if a <= 0.0:  # along the axis of a cylinder
-        return _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz)
+        return 0.0, 0.0
     root = math.sqrt(max(b * b - a * c, 0.0))
-    facing = own[0] * dx + own[1] * dy + own[2] * dz
-    on_face = (own[3] - own[0] * ox - own[1] * oy - own[2] * oz) / facing if facing != 0.0 else 0.0
-    t = (-b - root) / a if a * on_face < -b else (-b + root) / a  # whichever is nearer to the facet
+    t = (-b - root) / a
     nx, ny, nz = hx + t * gx, hy + t * gy, hz + t * gz
-    size = math.sqrt(nx * nx + ny * ny + nz * nz)
-    return t, root / size
+    return t, root / math.sqrt(nx * nx + ny * ny + nz * nz)
 
 
 @kernel

@@ -59,7 +59,7 @@ class MeshTopology(NamedTuple):
     albedo : (f,) float64
         Of each face, relative to that of the surface.
     quadric : (f,) int32
-        Which quadric is the true surface of the face, −1 for none.
+        Which quadric the face is, −1 for none: then it is a triangle, or the plane face of a solid.
     quadrics : (q, 10) float64
         A (xx, yy, zz, xy, xz, yz), b (3) and c of surfaces pᵀ A p + 2 b · p + c = 0, negative inside.
     closed : (f,) bool
@@ -81,6 +81,13 @@ class MeshTopology(NamedTuple):
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
         differ from those at most, the largest reach, how far the faces' corners are from the point at most, and where
         among the smooth faces it begins and how many it has.
+    curves : (c, 14) float64
+        Edges of round faces, see :mod:`~phasemark.render.integral.round_edges`.
+    parts : (k, 2) int64
+        First face of each convex part of solids, and the one behind the last; see
+        :mod:`~phasemark.render.integral.convex_parts`.
+    balls : (k, 4) float64
+        Centre and radius of a ball around each.
     low, high : (3,) float64
         Corners of the box around all vertices.
     split : bool
@@ -111,6 +118,9 @@ class MeshTopology(NamedTuple):
     first_fold: NDArray[np.int32]
     smooth_planes: NDArray[np.float64]
     clusters: NDArray[np.float64]
+    curves: NDArray[np.float64]
+    parts: NDArray[np.int64]
+    balls: NDArray[np.float64]
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     split: bool
@@ -138,7 +148,6 @@ class MeshTopology(NamedTuple):
         faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
-        quadric = np.asarray(mesh.face_attributes.get("quadric", np.full(len(faces), -1)), dtype=np.int32)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -148,14 +157,14 @@ class MeshTopology(NamedTuple):
             raise UsageError("the mesh has no face with an area")
         kept = np.flatnonzero(kept)
         kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
-        faces, part, albedo, quadric, a = faces[kept], part[kept], albedo[kept], quadric[kept], a[kept]
+        faces, part, albedo, a = faces[kept], part[kept], albedo[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
         edges, regular = _edges(faces)
         first, other = edges[:, 2], edges[:, 3]
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
         crease = ~regular | (turn > crease_rad + 1e-9)
-        crease |= (albedo[first] != albedo[other]) | (quadric[first] != quadric[other])
+        crease |= albedo[first] != albedo[other]
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
@@ -164,7 +173,7 @@ class MeshTopology(NamedTuple):
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
         rise = np.einsum("ij,ij->i", planes[first, :3], off_edge) - planes[first, 3]
-        plain = (np.bincount(patch, ~flat)[patch] == 0) | (quadric >= 0)  # one surface for the whole patch
+        plain = np.bincount(patch, ~flat)[patch] == 0
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
         hollow = np.bincount(patch[first], ~crease & (rise > _HOLLOW * extent), minlength=patch.max() + 1)[patch] > 0
@@ -192,8 +201,8 @@ class MeshTopology(NamedTuple):
             grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
             albedo=np.ascontiguousarray(albedo),
-            quadric=np.ascontiguousarray(quadric),
-            quadrics=np.asarray(mesh.metadata.get("quadrics", np.zeros((0, 10))), np.float64),
+            quadric=np.full(len(faces), -1, np.int32),
+            quadrics=np.zeros((0, 10)),
             closed=np.full(len(faces), closed),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(rise[crease] > 0),
@@ -201,6 +210,9 @@ class MeshTopology(NamedTuple):
             first_fold=first_fold,
             smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces].T),
             clusters=clusters,
+            curves=np.zeros((0, 14)),
+            parts=np.zeros((0, 2), np.int64),
+            balls=np.zeros((0, 4)),
             low=vertices.min(axis=0),
             high=vertices.max(axis=0),
             split=closed,
@@ -232,6 +244,9 @@ class MeshTopology(NamedTuple):
             first_fold=np.zeros(1, np.int32),
             smooth_planes=np.zeros((5, 0)),
             clusters=np.zeros((0, 13)),
+            curves=np.zeros((0, 14)),
+            parts=np.zeros((0, 2), np.int64),
+            balls=np.zeros((0, 4)),
             low=np.zeros(3),
             high=np.zeros(3),
             split=True,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.integral.area_integral import mesh_digest
+from phasemark.render.integral.convex_parts import enter_parts, part_around
 from phasemark.render.integral.face_search import FaceGrid
 from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, in_lines
@@ -23,6 +24,7 @@ from phasemark.render.integral.shells import unite_shells
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body, Surface
 from phasemark.render.scene.crossings import crossings
+from phasemark.render.scene.solids import Solid
 
 _NO_GRID = FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_))
 _WATCHED = np.array([[1.0, 0.31, 0.17], [-0.23, 1.0, 0.41], [0.37, -0.19, 1.0]])
@@ -47,13 +49,19 @@ class Assembly:
 
     def __init__(self, bodies: Sequence[Body], intersector: str) -> None:
         self._kind = intersector
-        self._own = _analysed(bodies)
+        self._solids = _solids(bodies)
+        self._own = _analysed(bodies, self._solids)
+        self._shells = [
+            _shell(body, solid, mesh) for body, solid, mesh in zip(bodies, self._solids, self._own, strict=True)
+        ]
         self._poses = np.array([body.pose for body in bodies])
         self._moving = np.zeros(len(bodies), np.bool_)
         self._still: tuple[NDArray[np.int64], Intersector] | None = None
         self._of_shapes: dict[int, Intersector] = {}
+        self._first = _Firsts.of(self._own, self._solids)
+        self._parts = _Parts.of(self._solids, self._first)
+        self._frames = _Placed.joined(self._own, self._parts.balls)
         self._curves: dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
-        self._first = _Firsts.of(self._own)
         self._bounds = np.empty((len(bodies), 2, 3))
         self._base = self._joined()
         self._turn(np.arange(len(bodies)))
@@ -72,6 +80,8 @@ class Assembly:
             smooth_planes=base.smooth_planes.copy(),
             clusters=base.clusters.copy(),
             quadrics=base.quadrics.copy(),
+            curves=base.curves.copy(),
+            balls=base.balls.copy(),
         )
         return other
 
@@ -109,6 +119,13 @@ class Assembly:
         ------
         UsageError
         """
+        mesh = self.topology
+        for frame, lens in zip(frames, lens_m, strict=True):
+            part = part_around(mesh, lens)
+            if part >= 0:
+                raise _inside(int(frame), names[mesh.part[mesh.parts[part, 0]]])
+        if all(solid is not None for solid in self._solids):
+            return
         directions = np.concatenate([_WATCHED, -_WATCHED])
         rays = np.tile(directions, (len(lens_m), 1))
         face = self.intersector.first_face(
@@ -118,11 +135,7 @@ class Assembly:
         inside = np.flatnonzero((face >= 0) & self.topology.closed[face] & from_behind)
         if inside.size:
             k = int(inside[0])
-            raise UsageError(
-                f"in frame {frames[k // len(directions)]} the lens is inside body"
-                f" '{names[self.topology.part[face[k]]]}': move one of them, leave the body out, or, if it is a room,"
-                " turn its faces inward"
-            )
+            raise _inside(int(frames[k // len(directions)]), names[self.topology.part[face[k]]])
 
     def _joined(self) -> MeshTopology:
         """Join the arrays that do not depend on poses, and make room for those that do."""
@@ -159,6 +172,9 @@ class Assembly:
             first_fold=np.append(np.concatenate(begins), first.fold[-1]).astype(np.int32),
             smooth_planes=np.empty((5, n_smooth)),
             clusters=np.concatenate([_from_smooth(mesh.clusters, first.smooth[b]) for b, mesh in enumerate(own)]),
+            curves=np.empty((first.curve[-1], 14)),
+            parts=self._parts.faces,
+            balls=np.empty_like(self._parts.balls),
             low=np.zeros(3),
             high=np.zeros(3),
             split=True,
@@ -167,18 +183,12 @@ class Assembly:
 
     def _turn(self, moved: NDArray[np.int64]) -> None:
         """Write the arrays of bodies that moved, and find where they cross others."""
-        mesh, first = self._base, self._first
-        for b in moved:
-            own, transposed, offset = self._own[b], self._poses[b, :3, :3].T, self._poses[b, :3, 3]
-            vertex, face = slice(*first.vertex[b : b + 2]), slice(*first.face[b : b + 2])
-            smooth, cluster = slice(*first.smooth[b : b + 2]), slice(*first.cluster[b : b + 2])
-            _turn_arrays(
-                own, transposed, offset, mesh.vertices[vertex], mesh.planes[face], mesh.corner_normals[face],
-                mesh.search[face], mesh.smooth_planes[:, smooth], mesh.clusters[cluster],
-            )  # fmt: skip
-            mesh.quadrics[slice(*first.quadric[b : b + 2])] = _turned_quadrics(own.quadrics, transposed, offset)
-            corners = mesh.vertices[vertex]
-            self._bounds[b] = corners.min(axis=0), corners.max(axis=0)
+        mesh = self._base
+        placed = _Placed(
+            mesh.vertices, mesh.planes, mesh.corner_normals, mesh.search, mesh.smooth_planes, mesh.clusters,
+            mesh.quadrics, mesh.curves, mesh.balls,
+        )  # fmt: skip
+        _turn_bodies(moved, self._poses, self._first, self._frames, placed, self._bounds)
         self._cross(moved)
         self.topology = self._with_curves()
         self.intersector = self._intersectors()
@@ -193,13 +203,31 @@ class Assembly:
             done[b] = True
             for other in np.flatnonzero(meets & ~done):
                 one, two = sorted((int(b), int(other)))  # the same curves to the last bit, whichever moved
-                ends, pairs = crossings(self._base.vertices, self._faces(one), self._faces(two))
+                if self._apart(one, two):
+                    continue
+                (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
+                ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
                 if len(ends):
+                    pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]])
                     self._curves[one, two] = ends, pairs + self._first.face[[one, two]]
 
-    def _faces(self, b: int) -> NDArray[np.int32]:
-        """Return the faces of a body, (f, 3)."""
-        return self._base.faces[slice(*self._first.face[b : b + 2])]
+    def _apart(self, one: int, two: int) -> bool:
+        """Return whether balls around the parts of two bodies keep apart; a mesh is one part."""
+        balls = []
+        for b in (one, two):
+            own = self._base.balls[slice(*self._first.part[b : b + 2])]
+            if not len(own):
+                low, high = self._bounds[b]
+                own = np.array([[*(low + high) / 2, np.linalg.norm(high - low) / 2]])
+            balls.append(own)
+        away = np.linalg.norm(balls[0][:, None, :3] - balls[1][None, :, :3], axis=-1)
+        return bool((away > balls[0][:, None, 3] + balls[1][None, :, 3]).all())
+
+    def _placed_shell(self, b: int) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
+        """Return the triangles of a body where it stands, and the face of the body that each of them stands for."""
+        vertices, faces, face = self._shells[b]
+        pose = self._poses[b]
+        return product(vertices, pose[:3, :3].T) + pose[:3, 3], faces, face
 
     def _with_curves(self) -> MeshTopology:
         """Return the surface with the curves among its creases."""
@@ -222,11 +250,12 @@ class Assembly:
     def _intersectors(self) -> Intersector:
         """Return the intersector: of all that stands still, and of each body that moves in its own frame."""
         mesh = self._base
+        solid = np.array([own is not None for own in self._solids])
         if self._still is None:
-            numbers = np.flatnonzero(~self._moving[mesh.part])
+            numbers = np.flatnonzero(~(self._moving | solid)[mesh.part])
             self._still = numbers, make_intersector(mesh.vertices.copy(), mesh.faces[numbers], self._kind)
-        moving = np.flatnonzero(self._moving)
-        if not moving.size:
+        moving = np.flatnonzero(self._moving & ~solid)
+        if not moving.size and not solid.any():
             return self._still[1]
         for b in moving:
             shape = id(self._own[b].vertices)
@@ -239,7 +268,14 @@ class Assembly:
             )
             for b in moving
         ]  # fmt: skip
-        return _NearestOf(mesh.planes, *self._still, movers)
+        return _NearestOf(mesh, *self._still, movers)
+
+
+def _inside(frame: int, name: str) -> UsageError:
+    return UsageError(
+        f"in frame {frame} the lens is inside body '{name}': move one of them, leave the body out, or, if it is a room,"
+        " turn its faces inward"
+    )
 
 
 class _Mover(NamedTuple):
@@ -253,31 +289,34 @@ class _Mover(NamedTuple):
 
 
 class _NearestOf:
-    """Finds the first face among those that stand still and those of bodies that move."""
+    """Finds the first face among triangles that stand still, those of bodies that move, and solids."""
 
     def __init__(
         self,
-        planes: NDArray[np.float64],
+        mesh: MeshTopology,
         numbers: NDArray[np.int64],
         still: Intersector,
         movers: Sequence[_Mover],
     ) -> None:
-        self._planes, self._numbers, self._still, self._movers = planes, numbers, still, movers
+        self._mesh, self._numbers, self._still, self._movers = mesh, numbers, still, movers
 
     def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """Return the number of the first face met by each ray, −1 where none is."""
-        n = len(origins)
-        found, distance, rays = np.full(n, -1, np.int32), np.full(n, np.inf), np.arange(n)
-        faces = self._still.first_face(origins, directions)
-        _keep_nearer(self._planes, self._numbers, faces, rays, origins, directions, found, distance)
-        own_origins, own_directions = np.empty_like(origins), np.empty_like(directions)
+        n, mesh = len(origins), self._mesh
+        found, distance = np.full(n, -1, np.int32), np.full(n, np.inf)
+        if len(self._numbers):
+            faces = self._still.first_face(origins, directions)
+            _keep_nearer(mesh.planes, self._numbers, faces, np.arange(n), origins, directions, found, distance)
+        if self._movers:
+            rays, own_origins, own_directions = np.arange(n), np.empty_like(origins), np.empty_like(directions)
         for mover in self._movers:
             count = _aimed_at(
                 mover.centre, mover.radius_m, mover.pose, origins, directions, rays, own_origins, own_directions
             )
             if count:
                 faces = mover.intersector.first_face(own_origins[:count], own_directions[:count])
-                _keep_nearer(self._planes, mover.numbers, faces, rays, origins, directions, found, distance)
+                _keep_nearer(mesh.planes, mover.numbers, faces, rays, origins, directions, found, distance)
+        enter_parts(mesh, origins, directions, found, distance)
         return found
 
 
@@ -323,29 +362,120 @@ def _keep_nearer(planes, numbers, faces, rays, origins, directions, found, dista
             found[i], distance[i] = f, t
 
 
+class _Placed(NamedTuple):
+    """Arrays that depend on where bodies stand, of all of them, as the surface has them; and balls around parts."""
+
+    vertices: NDArray[np.float64]
+    planes: NDArray[np.float64]
+    corner_normals: NDArray[np.float32]
+    search: NDArray[np.float32]
+    smooth_planes: NDArray[np.float64]
+    clusters: NDArray[np.float64]
+    quadrics: NDArray[np.float64]
+    curves: NDArray[np.float64]
+    balls: NDArray[np.float64]
+
+    @classmethod
+    def joined(cls, own: Sequence[MeshTopology], balls: NDArray[np.float64]) -> _Placed:
+        """Join the arrays of bodies, each in its own frame."""
+        return cls(
+            np.concatenate([mesh.vertices for mesh in own]),
+            np.concatenate([mesh.planes for mesh in own]),
+            np.concatenate([mesh.corner_normals for mesh in own]),
+            np.concatenate([mesh.search for mesh in own]),
+            np.concatenate([mesh.smooth_planes for mesh in own], axis=1),
+            np.concatenate([mesh.clusters for mesh in own]),
+            np.concatenate([mesh.quadrics for mesh in own]),
+            np.concatenate([mesh.curves for mesh in own]),
+            balls,
+        )
+
+
+class _Parts(NamedTuple):
+    """Convex parts of solids: first face and the one behind the last, (k, 2), and balls in their own frames, (k, 4)."""
+
+    faces: NDArray[np.int64]
+    balls: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, solids: Sequence[Solid | None], first: _Firsts) -> _Parts:
+        """Join the parts of solids."""
+        faces, balls = [np.zeros((0, 2), np.int64)], [np.zeros((0, 4))]
+        for b, solid in enumerate(solids):
+            if solid is not None:
+                faces.append(first.face[b] + np.column_stack([solid.first[:-1], solid.first[1:]]))
+                balls.append(solid.balls)
+        return cls(np.concatenate(faces), np.concatenate(balls))
+
+
+@njit(cache=True, nogil=True)
+def _turn_bodies(moved, poses, first, own, placed, bounds):  # type: ignore[no-untyped-def]
+    """Write the arrays of bodies that were turned and moved, and the boxes around these."""
+    for b in moved:
+        pose = poses[b]
+        transposed, offset = pose[:3, :3].T, pose[:3, 3]
+        bounds[b, 0], bounds[b, 1] = np.inf, -np.inf
+        for i in range(first.vertex[b], first.vertex[b + 1]):
+            _move(own.vertices[i], transposed, offset, placed.vertices[i])
+            for k in range(3):
+                bounds[b, 0, k] = min(bounds[b, 0, k], placed.vertices[i, k])
+                bounds[b, 1, k] = max(bounds[b, 1, k], placed.vertices[i, k])
+        for f in range(first.face[b], first.face[b + 1]):
+            _turn_plane(own.planes[f], transposed, offset, 1.0, placed.planes[f])
+            for k in range(0, 9, 3):
+                _turn(own.corner_normals[f, k : k + 3], transposed, placed.corner_normals[f, k : k + 3])
+            for k in range(4):
+                placed.search[f, k] = placed.planes[f, k]
+            _turn_plane(own.search[f, 4:8], transposed, offset, -1.0, placed.search[f, 4:8])
+            _turn_plane(own.search[f, 8:12], transposed, offset, -1.0, placed.search[f, 8:12])
+        for i in range(first.smooth[b], first.smooth[b + 1]):
+            _turn_plane(own.smooth_planes[:4, i], transposed, offset, 1.0, placed.smooth_planes[:4, i])
+            placed.smooth_planes[4, i] = own.smooth_planes[4, i]
+        for c in range(first.cluster[b], first.cluster[b + 1]):
+            _move(own.clusters[c, :3], transposed, offset, placed.clusters[c, :3])
+            _turn(own.clusters[c, 3:6], transposed, placed.clusters[c, 3:6])
+        for q in range(first.quadric[b], first.quadric[b + 1]):
+            _turn_quadric(own.quadrics[q], transposed, offset, placed.quadrics[q])
+        for c in range(first.curve[b], first.curve[b + 1]):
+            placed.curves[c, 0], placed.curves[c, 13] = own.curves[c, 0], b
+            _move(own.curves[c, 1:4], transposed, offset, placed.curves[c, 1:4])
+            for k in range(4, 13, 3):
+                _turn(own.curves[c, k : k + 3], transposed, placed.curves[c, k : k + 3])
+        for p in range(first.part[b], first.part[b + 1]):
+            _move(own.balls[p, :3], transposed, offset, placed.balls[p, :3])
+            placed.balls[p, 3] = own.balls[p, 3]
+            if first.vertex[b] == first.vertex[b + 1]:  # a solid without corners
+                for k in range(3):
+                    bounds[b, 0, k] = min(bounds[b, 0, k], placed.balls[p, k] - placed.balls[p, 3])
+                    bounds[b, 1, k] = max(bounds[b, 1, k], placed.balls[p, k] + placed.balls[p, 3])
+
+
 @njit(cache=True)
-def _turn_arrays(own, transposed, offset, vertices, planes, corner_normals, search, smooth, clusters):  # type: ignore[no-untyped-def]
-    """Write the arrays of a body that was turned and moved."""
-    for i in range(len(vertices)):
-        _turn(own.vertices[i], transposed, vertices[i])
+def _move(point, transposed, offset, out):  # type: ignore[no-untyped-def]
+    _turn(point, transposed, out)
+    for k in range(3):
+        out[k] += offset[k]
+
+
+@njit(cache=True)
+def _turn_quadric(own, transposed, offset, out):  # type: ignore[no-untyped-def]
+    """Turn and move p · A p + 2 b · p + c = 0: A' = R A Rᵀ, b' = R b − A' t, c' = c − (b' + R b) · t."""
+    places = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
+    for i in range(3):
+        for j in range(i, 3):
+            total = 0.0
+            for k in range(3):
+                for m in range(3):
+                    total += transposed[k, i] * own[places[k][m]] * transposed[m, j]
+            out[places[i][j]] = total
+    _turn(own[6:9], transposed, out[6:9])
+    constant = own[9]
+    for i in range(3):
+        turned = out[6 + i]
         for k in range(3):
-            vertices[i, k] += offset[k]
-    for f in range(len(planes)):
-        _turn_plane(own.planes[f], transposed, offset, 1.0, planes[f])
-        for k in range(3):
-            _turn(own.corner_normals[f, 3 * k : 3 * k + 3], transposed, corner_normals[f, 3 * k : 3 * k + 3])
-        for k in range(4):
-            search[f, k] = planes[f, k]
-        _turn_plane(own.search[f, 4:8], transposed, offset, -1.0, search[f, 4:8])
-        _turn_plane(own.search[f, 8:12], transposed, offset, -1.0, search[f, 8:12])
-    for i in range(smooth.shape[1]):
-        _turn_plane(own.smooth_planes[:4, i], transposed, offset, 1.0, smooth[:4, i])
-        smooth[4, i] = own.smooth_planes[4, i]
-    for c in range(len(clusters)):
-        _turn(own.clusters[c, :3], transposed, clusters[c, :3])
-        _turn(own.clusters[c, 3:6], transposed, clusters[c, 3:6])
-        for k in range(3):
-            clusters[c, k] += offset[k]
+            out[6 + i] -= out[places[i][k]] * offset[k]
+        constant -= (turned + out[6 + i]) * offset[i]
+    out[9] = constant
 
 
 @njit(cache=True)
@@ -376,9 +506,11 @@ class _Firsts(NamedTuple):
     fold: NDArray[np.int64]
     cluster: NDArray[np.int64]
     quadric: NDArray[np.int64]
+    curve: NDArray[np.int64]
+    part: NDArray[np.int64]
 
     @classmethod
-    def of(cls, own: Sequence[MeshTopology]) -> _Firsts:
+    def of(cls, own: Sequence[MeshTopology], solids: Sequence[Solid | None]) -> _Firsts:
         """Count the arrays of bodies."""
         counts = [
             (
@@ -388,17 +520,42 @@ class _Firsts(NamedTuple):
                 len(mesh.folds),
                 len(mesh.clusters),
                 len(mesh.quadrics),
+                len(mesh.curves),
+                0 if solid is None else len(solid.balls),
             )
-            for mesh in own
+            for mesh, solid in zip(own, solids, strict=True)
         ]
-        return cls(*np.cumsum([(0,) * 6, *counts], axis=0).T)
+        return cls(*np.ascontiguousarray(np.cumsum([(0,) * 8, *counts], axis=0).T))
 
 
-def _analysed(bodies: Sequence[Body]) -> list[MeshTopology]:
+def _solids(bodies: Sequence[Body]) -> list[Solid | None]:
+    """Return the solids that are rendered in place of meshes; boxes are triangles where there are very many."""
+    many = 512  # every ray asks every solid
+    found = [body.solid for body in bodies]
+    if len(found) <= many:
+        return found
+    return [solid if solid is not None and len(solid.quadrics) else None for solid in found]
+
+
+_Shell = tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]
+"""Vertices, triangles, and the face of the body that each triangle stands for."""
+
+
+def _shell(body: Body, solid: Solid | None, own: MeshTopology) -> _Shell:
+    """Return the triangles in which crossings with other bodies are looked for."""
+    if solid is None or body.primitive is None:
+        return own.vertices, own.faces, np.arange(len(own.faces))
+    return body.primitive.vertices, np.asarray(body.mesh.faces, np.int32), body.primitive.face
+
+
+def _analysed(bodies: Sequence[Body], solids: Sequence[Solid | None]) -> list[MeshTopology]:
     """Analyse the mesh of each body, equal ones once."""
     known: dict[tuple[bytes, bool], MeshTopology] = {}
     found = []
-    for body in bodies:
+    for body, solid in zip(bodies, solids, strict=True):
+        if solid is not None:
+            found.append(solid.topology(float(body.albedo)))
+            continue
         mesh: Surface = Surface.of(body)
         key = mesh_digest(mesh), body.smooth
         if key not in known:
@@ -424,14 +581,3 @@ def _from_smooth(clusters: NDArray[np.float64], smooth: int) -> NDArray[np.float
     later = clusters.copy()
     later[:, 11] += smooth
     return later
-
-
-def _turned_quadrics(
-    quadrics: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return quadrics, (q, 10), of a body that was turned and moved."""
-    square = product(product(transposed.T, quadrics[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]), transposed)
-    own = product(quadrics[:, None, 6:9], transposed)[:, 0]
-    linear = own - product(square, offset[:, None])[..., 0]
-    constant = quadrics[:, 9] - product((linear + own)[:, None], offset[:, None])[:, 0, 0]
-    return np.column_stack([square[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], linear, constant])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.rigid import rigid_transforms
+from phasemark.render.scene.solids import Solid
 
 SEGMENTS = 96
 """Sides of the polygon that stands for a circle."""
@@ -33,16 +34,28 @@ class Surface:
         attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
-        metadata: dict[str, Any] = {}
-        if body.smooth and body.quadrics is not None:
-            attributes["quadric"], metadata["quadrics"] = body.quadrics
-        return cls(
-            np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, metadata
-        )
+        return cls(np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes)
 
 
 _CORNER = (math.pi / SEGMENTS) / math.sin(math.pi / SEGMENTS)
 """Radius of the polygon's corners, in radii of a circle of the same mean width (Cauchy: perimeter / π)."""
+
+
+class Primitive(NamedTuple):
+    """What a mesh stands for.
+
+    Parameters
+    ----------
+    solid : Solid
+    face : (f,) int64
+        The face of the solid that each triangle stands for.
+    vertices : (v, 3) float64
+        Of the mesh that was made of it.
+    """
+
+    solid: Solid
+    face: NDArray[np.int64]
+    vertices: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +75,9 @@ class Body:
     smooth : bool
         Whether normals are interpolated between faces that meet at less than 30°, as on a mesh that stands for a curved
         surface; False: every facet is flat.
-    quadrics : tuple, optional
-        Of round primitives: which quadric is the true surface of each face, (f,) int32, −1 for none, and the quadrics,
-        (q, 10), as :class:`~phasemark.render.integral.mesh_topology.MeshTopology` has them.
+    primitive : Primitive, optional
+        What the mesh stands for: the box, ellipsoid, cylinder or capsule that it was made of is rendered in its place
+        as long as nobody changes the mesh, or its facets (`albedo` of each, `smooth`).
 
     Raises
     ------
@@ -84,7 +97,7 @@ class Body:
     name: str = ""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     smooth: bool = True
-    quadrics: tuple[NDArray[np.int32], NDArray[np.float64]] | None = field(default=None, repr=False)
+    primitive: Primitive | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         if not (hasattr(self.mesh, "vertices") and hasattr(self.mesh, "faces")):
@@ -117,6 +130,14 @@ class Body:
         place = ", ".join(f"{x:g}" for x in self.pose[:3, 3])
         return f"Body('{self.name}', {len(self.mesh.faces)} faces, albedo {albedo}, at ({place}) m)"
 
+    @property
+    def solid(self) -> Solid | None:
+        """What is rendered in place of the mesh."""
+        own = self.primitive
+        if own is None or not (self.smooth and isinstance(self.albedo, float)):
+            return None
+        return own.solid if np.array_equal(self.mesh.vertices, own.vertices) else None
+
     def named(self, name: str) -> Body:
         """Return the body under another name."""
         return replace(self, name=name)
@@ -132,7 +153,11 @@ class Body:
         albedo, name, pose
             As for the class; no pose: the identity.
         """
-        return cls._of(trimesh.creation.box(_lengths(size_m, 3, "size_m")), albedo, name, pose)
+        size = _lengths(size_m, 3, "size_m")
+        mesh = trimesh.creation.box(size)
+        solid = Solid.box(size)
+        face = np.argmax(np.asarray(mesh.face_normals) @ solid.planes[:, :3].T, axis=1)
+        return cls._of(mesh, albedo, name, pose, solid, face)
 
     @classmethod
     def plane(cls, size_m: ArrayLike, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None) -> Body:
@@ -173,8 +198,7 @@ class Body:
         angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, SEGMENTS // 2 + 1)
         ball = _turned(np.cos(angle), np.sin(angle))
         ball.vertices = ball.vertices * half * math.sqrt(4 * math.pi / ball.area)
-        quadric = [*1 / half**2, 0, 0, 0, 0, 0, 0, -1]
-        return cls._of(ball, albedo, name, pose, np.zeros(len(ball.faces)), [quadric])
+        return cls._of(ball, albedo, name, pose, Solid.ellipsoid(half), np.zeros(len(ball.faces)))
 
     @classmethod
     def cylinder(
@@ -190,10 +214,11 @@ class Body:
         """
         radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
         rho, z = np.array([0.0, 1.0, 1.0, 0.0]), np.array([-0.5, -0.5, 0.5, 0.5])
-        solid = _turned(radius * _CORNER * rho, height * z)
-        ends = np.abs(solid.face_normals[:, 2]) > math.sqrt(0.5)
-        side = [1, 1, 0, 0, 0, 0, 0, 0, 0, -(radius**2)]
-        return cls._of(solid, albedo, name, pose, np.where(ends, -1, 0), [side])
+        mesh = _turned(radius * _CORNER * rho, height * z)
+        up = np.asarray(mesh.face_normals)[:, 2]
+        steep = math.sqrt(0.5)
+        face = np.where(up > steep, 1, np.where(up < -steep, 2, 0))
+        return cls._of(mesh, albedo, name, pose, Solid.cylinder(radius, height), face)
 
     @classmethod
     def capsule(
@@ -212,12 +237,10 @@ class Body:
         radius, height = _lengths((radius_m, height_m), 2, "radius_m, height_m")
         angle = np.linspace(0.0, 0.5 * math.pi, SEGMENTS // 4 + 1)
         rho, z = radius * _CORNER * np.cos(angle), radius * _CORNER * np.sin(angle) + 0.5 * height
-        solid = _turned([*rho[::-1], *rho], [*-z[::-1], *z])
-        centre, side = 0.5 * height, [1, 1, 0, 0, 0, 0, 0, 0, 0, -(radius**2)]
-        balls = [[1, 1, 1, 0, 0, 0, 0, 0, -z, z**2 - radius**2] for z in (centre, -centre)]
-        middle = solid.triangles_center[:, 2]
-        which = np.where(middle > centre, 1, np.where(middle < -centre, 2, 0))
-        return cls._of(solid, albedo, name, pose, which, [side, *balls])
+        mesh = _turned([*rho[::-1], *rho], [*-z[::-1], *z])
+        middle = mesh.triangles_center[:, 2]
+        face = np.where(middle > 0.5 * height, 3, np.where(middle < -0.5 * height, 4, 0))
+        return cls._of(mesh, albedo, name, pose, Solid.capsule(radius, height), face)
 
     @classmethod
     def height_field(
@@ -276,11 +299,14 @@ class Body:
         albedo: float,
         name: str,
         pose: ArrayLike | None,
-        which: ArrayLike | None = None,
-        quadrics: ArrayLike = (),
+        solid: Solid | None = None,
+        face: ArrayLike = (),
     ) -> Body:
-        true = None if which is None else (np.asarray(which, np.int32), np.asarray(quadrics, np.float64))
-        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), quadrics=true)
+        """Return a body of a mesh that stands for a solid."""
+        own = None
+        if solid is not None:
+            own = Primitive(solid, np.asarray(face, np.int64), np.array(mesh.vertices, np.float64))
+        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), primitive=own)
 
 
 def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
