@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from phasemark import UsageError
-from phasemark.render import Background, Renderer, Sensor, capture, preset, zones_from_depth
+from phasemark.render import Background, Body, Renderer, Scene, SceneRenderer, Sensor, capture, preset, zones_from_depth
 from phasemark.render.direct import HistogramRenderer
 from phasemark.render.integral.intersect import make_intersector
 
@@ -147,6 +147,30 @@ def test_a_furnished_room_seen_by_turned_depth_cameras_meets_the_bars():
         print(n, true, stated)
         assert true < allowed
         assert 0.5 < stated / true < 2
+
+
+def test_rolling_the_depth_camera_spreads_the_error_of_edges_along_columns():
+    n, wider, rng = 256, 0.45, np.random.default_rng(7)
+    turn = turned((0.0, 0.0, 4.0))
+    errors = {"level": [], "rolled": []}
+    for _ in range(8):
+        left, right, top, bottom = rng.uniform(0.1, 0.3, 4) * [-1, 1, -1, 1]
+        plate = Body.plane(
+            (0.8 * (right - left), 0.8 * (bottom - top)),
+            pose=[[0, 0, 1, 0.8], [-1, 0, 0, -0.4 * (left + right)], [0, -1, 0, -0.4 * (top + bottom)], [0, 0, 0, 1]],
+        )
+        wall = Body.plane((9, 9), pose=[[0, 0, 1, 2.0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+        exact = SceneRenderer(Scene([plate, wall]), ZONES).render(np.eye(4)).phasors[0]
+        for name, turn_of, tangent in (("level", np.eye(3), TAN), ("rolled", turn, wider)):
+            rays = np.stack([*tangents(n, tangent), np.ones((n, n))], axis=-1) @ turn_of.T
+            x, y = rays[..., 0], rays[..., 1]
+            depth = np.where((x > left) & (x < right) & (y > top) & (y < bottom), 0.8, 2.0)
+            zones = zones_from_depth(depth, intrinsics(n, tangent), ZONES, depth2camera=turn_of)
+            errors[name].append(rms_share(zones.images.phasors[0], exact))
+    level, rolled = (np.sqrt(np.mean(np.square(errors[name]))) for name in ("level", "rolled"))
+    print(level, rolled)
+    assert level > BARS[n]  # a quarter of a pixel, the mean, along whole edges
+    assert rolled < 0.5 * level
 
 
 def test_pixels_that_a_border_cuts_count_in_part():
