@@ -28,7 +28,7 @@ _FOLDERS = {
     "render/scene": "assembly crossings depth_slopes",
     "render/integral": (
         "arguments bent_edges borders circular components convex_parts edge_motion edge_projection edges_in_pixels"
-        " face_search floor_phase image_rays intersect intervals light limbs mesh_topology pixel_splitting"
+        " face_search floor_phase gloss image_rays intersect intervals light limbs mesh_topology pixel_splitting"
         " quadrature_rules ray_plan round_edges strips swept_light visible_faces"
     ),
 }

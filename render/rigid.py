@@ -54,21 +54,22 @@ def rigid_transforms(transforms: ArrayLike, name: str = "landmark2cam") -> NDArr
     UsageError
         A matrix is not finite, or not a rotation with a translation.
     """
+    what = f"'{name}'" if name.isidentifier() else name
     try:
         array = np.asarray(transforms, dtype=np.float64)
     except (TypeError, ValueError):
-        raise UsageError(f"'{name}' must have shape (n, 4, 4), got what is no array of numbers") from None
+        raise UsageError(f"{what} must have shape (n, 4, 4), got what is no array of numbers") from None
     given = array.shape
     if array.ndim == 2:
         array = array[None]
     if array.shape[1:] != (4, 4):
-        raise UsageError(f"'{name}' must have shape (n, 4, 4), got {given}")
+        raise UsageError(f"{what} must have shape (n, 4, 4), got {given}")
     if not np.isfinite(array).all():
-        raise UsageError(f"'{name}' must be finite")
+        raise UsageError(f"{what} must be finite, matrix {int(np.argmin(np.isfinite(array).all(axis=(1, 2))))} is not")
     square = np.einsum("nij,nkj->nik", array[:, :3, :3], array[:, :3, :3])
     off = np.abs(square - np.eye(3)).max(axis=(1, 2))
     bottom = np.abs(array[:, 3] - [0, 0, 0, 1]).max(axis=1)
     wrong = (off > 1e-4) | (bottom > 1e-9) | (np.linalg.det(array[:, :3, :3]) < 0)
     if wrong.any():
-        raise UsageError(f"'{name}' must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
+        raise UsageError(f"{what} must be a rotation and a translation, matrix {int(wrong.argmax())} is not")
     return array

@@ -149,6 +149,13 @@ def test_a_furnished_room_seen_by_turned_depth_cameras_meets_the_bars():
         assert 0.5 < stated / true < 2
 
 
+def facing(*place):
+    """Return the pose of a plane that faces the camera, x to the right and y down."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], place
+    return pose
+
+
 def test_rolling_the_depth_camera_spreads_the_error_of_edges_along_columns():
     n, wider, rng = 256, 0.45, np.random.default_rng(7)
     turn = turned((0.0, 0.0, 4.0))
@@ -157,10 +164,10 @@ def test_rolling_the_depth_camera_spreads_the_error_of_edges_along_columns():
         left, right, top, bottom = rng.uniform(0.1, 0.3, 4) * [-1, 1, -1, 1]
         plate = Body.plane(
             (0.8 * (right - left), 0.8 * (bottom - top)),
-            pose=[[0, 0, 1, 0.8], [-1, 0, 0, -0.4 * (left + right)], [0, -1, 0, -0.4 * (top + bottom)], [0, 0, 0, 1]],
+            pose=facing(0.8, -0.4 * (left + right), -0.4 * (top + bottom)),
         )
-        wall = Body.plane((9, 9), pose=[[0, 0, 1, 2.0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-        exact = SceneRenderer(Scene([plate, wall]), ZONES).render(np.eye(4)).phasors[0]
+        wall = Body.plane((9, 9), pose=facing(2.0, 0.0, 0.0))
+        exact = SceneRenderer(Scene([plate, wall]), ZONES).phasors(np.eye(4)).phasors[0]
         for name, turn_of, tangent in (("level", np.eye(3), TAN), ("rolled", turn, wider)):
             rays = np.stack([*tangents(n, tangent), np.ones((n, n))], axis=-1) @ turn_of.T
             x, y = rays[..., 0], rays[..., 1]

@@ -29,10 +29,13 @@ def placed(place: Any = (0, 0, 0), rotation: Any = None) -> Array:
 def body_of(solid: Solid) -> Body:
     options: dict[str, Any] = {"albedo": solid.albedo, "pose": placed(solid.place, solid.rotation)}
     if solid.kind == "box":
-        return Body.box(2 * np.array(solid.size), **options)
-    if solid.kind == "sphere":
-        return Body.sphere(solid.size[0], **options)
-    return Body.capsule(solid.size[0], 2 * solid.size[1], **options)
+        body = Body.box(2 * np.array(solid.size), **options)
+    elif solid.kind == "sphere":
+        body = Body.sphere(solid.size[0], **options)
+    else:
+        body = Body.capsule(solid.size[0], 2 * solid.size[1], **options)
+    retroreflecting, specular, shininess = solid.gloss
+    return body.with_gloss(retroreflecting=retroreflecting, specular=specular, shininess=shininess)
 
 
 def random_solids(rng: np.random.Generator, n: int) -> list[Solid]:
@@ -127,6 +130,36 @@ def test_histograms_of_a_scene_are_those_of_the_landmark_and_sum_up():
     assert frames.counts.shape == (1, 3, 8, 8, sensor.histogram.bins)
 
 
+def test_glossy_bodies_return_what_dense_rays_with_their_brdf_do():
+    tilted = Rotation.from_euler("zyx", [0.2, 0.15, 0.1]).as_matrix()
+    solids = [
+        Solid("box", (0.05, 3.0, 3.0), tilted, np.array([1.55, 0.0, 0.0]), 0.4, (0.0, 0.1, 100.0)),
+        Solid("sphere", (0.2,), np.eye(3), np.array([1.0, 0.12, 0.05]), 0.2, (0.0, 0.3, 40.0)),
+        Solid("sphere", (0.04,), np.eye(3), np.array([0.9, -0.2, -0.17]), 0.2, (0.0, 0.3, 300.0)),
+        Solid("capsule", (0.06, 0.15), tilted, np.array([1.0, -0.15, 0.12]), 0.4, (1.5, 0.0, 1.0)),
+    ]
+    phasor, _ = errors(solids, placed(), WIDE.with_(modulation_hz=60e6), 320)
+    assert phasor < 5e-4  # of the rays, as above
+    plain, _ = errors([solid._replace(gloss=(0.0, 0.0, 1.0)) for solid in solids], placed(), WIDE, 40)
+    assert plain < 1e-2
+
+
+@pytest.mark.parametrize("gloss", [{"retroreflecting": 3.0}, {"specular": 0.2, "shininess": 400.0}])
+def test_a_glossy_wall_gives_a_direct_sensor_the_light_of_its_closed_form(gloss):
+    sensor, wall = preset("vl53l5cx-8x8"), Body.box((0.1, 9.0, 9.0), albedo=0.4, pose=placed((1.05, 0, 0)))
+    matte, glossy = (SceneRenderer(Scene([body]), sensor) for body in (wall, wall.with_gloss(**gloss)))
+    m, tangent = gloss.get("shininess", 1.0), np.tan(np.radians(22.5)) * (np.arange(400) - 199.5) / 800
+    lobe = gloss.get("specular", 0.0) * (m + 2) * (m + 4) / (8 * (m + 2 ** (-m / 2)))
+    cosine = 1 / np.sqrt(1 + tangent**2 + tangent[:, None] ** 2)
+    more = (cosine**2 * (0.4 * cosine + gloss.get("retroreflecting", 0.0) + lobe * cosine ** (m + 1))).sum()
+    ratio = more / (cosine**2 * 0.4 * cosine).sum()  # over the four zones in the middle
+    middle = 0, slice(3, 5), slice(3, 5)
+    intensity = [renderer.phasors(np.eye(4)).intensity[middle].sum() for renderer in (matte, glossy)]
+    np.testing.assert_allclose(intensity[1] / intensity[0], ratio, rtol=1e-3)
+    signal = [renderer.histograms(np.eye(4)).signal[middle].sum() for renderer in (matte, glossy)]
+    np.testing.assert_allclose(signal[1] / signal[0], ratio, rtol=2e-2)  # zones reach a little beyond their share
+
+
 @pytest.mark.parametrize("height_m", [0.05, 0.3])
 def test_a_body_seen_at_a_slant_is_resolved_in_range_as_a_floor_behind(height_m):
     sensor = preset("vl53l5cx-8x8")
@@ -148,6 +181,20 @@ def test_a_room_seen_from_inside_has_no_gap():
     solid = Body(trimesh.creation.box((4.0, 3.0, 2.5)), name="solid")
     with pytest.raises(UsageError, match="in frame 2 the lens is inside body 'solid'"):
         SceneRenderer(Scene([solid]), WIDE).phasors([placed((5, 0, 0)), placed((0, 5, 0)), placed()])
+
+
+def test_bodies_joined_into_one_keep_their_albedos_and_round_surfaces():
+    tilted = Rotation.from_euler("zyx", [0.2, 0.3, 0.5]).as_matrix()
+    solids = [
+        Solid("capsule", (0.1, 0.15), tilted, np.array([1.0, 0.1, 0.0]), 0.3),
+        Solid("sphere", (0.17,), np.eye(3), np.array([1.05, -0.05, 0.06]), 0.7),
+        Solid("box", (0.05, 0.25, 0.05), tilted @ tilted, np.array([1.0, 0.0, -0.1]), 0.7),
+    ]
+    robot = Body.joined((body_of(solid) for solid in solids), "robot")
+    image = SceneRenderer(Scene([robot]), WIDE).phasors(placed())
+    phasor, shares = pixels(solids, placed(), (4, 4), math.radians(22.5), WIDE.frequencies_hz[0], 320)
+    np.testing.assert_allclose(image.phasor[0], phasor, atol=5e-4 * np.abs(phasor).max())
+    np.testing.assert_allclose(image.coverage[0], shares.sum(axis=-1), atol=1e-3)
 
 
 def test_moving_bodies_are_rendered_as_where_they_stand():
@@ -267,11 +314,22 @@ def test_a_file_with_materials_becomes_a_scene(tmp_path):
         (lambda: Body.sphere(-1), "positive numbers of metres"),
         (lambda: Body.box((1, 2)), "'size_m' must be 3 positive numbers"),
         (lambda: Body.sphere(1, albedo=1.2), r"'albedo' must be in \[0, 1\], got 1.2"),
+        (lambda: Body.sphere(1).with_gloss(specular=0.3), "together must be at most 1, got 0.8 \\+ 0.3"),
+        (lambda: Body.sphere(1).with_gloss(shininess=0), r"'shininess' must be in \[1, 1000\], got 0"),
+        (lambda: Body.sphere(1).with_gloss(retroreflecting=np.nan), "must be finite and at least 0, got nan"),
         (lambda: Body(trimesh.creation.box(), np.ones(3)), "one for each of 12 faces"),
-        (lambda: Body.sphere(1, pose=np.full((4, 4), np.nan)), "pose of a body' must be finite"),
-        (lambda: Body.sphere(1, name="x", pose=np.diag([2, 1, 1, 1])), "pose of body 'x'' must be a rotation"),
+        (lambda: Body.sphere(1, pose=np.full((4, 4), np.nan)), "pose of a body must be finite"),
+        (lambda: Body.sphere(1, name="x", pose=np.diag([2, 1, 1, 1])), "pose of body 'x' must be a rotation"),
         (lambda: Body.height_field(np.diag([0, np.nan]), (1, 1)), "'heights_m' must be finite"),
         (lambda: Scene([Body.sphere(1)]).posed({"y": np.eye(4)}, 1), "no body is named 'y'"),
+        (
+            lambda: Scene([Body.sphere(1, name="x")]).posed(np.full((2, 1, 4, 4), np.nan), 2),
+            "pose of body 'x' must be finite, matrix 0",
+        ),
+        (lambda: Body.sphere("wide"), "must be 3 positive numbers of metres, got ..wide"),  # type: ignore[arg-type]
+        (lambda: Body.sphere(1, albedo="white"), "'albedo' must be numbers, got 'white'"),  # type: ignore[arg-type]
+        (lambda: Body(trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False)), "has an area"),
+        (lambda: Body.joined([]), "must be at least one, and agree"),
         (lambda: Scene([Body.sphere(1)]).posed(np.zeros((3, 3)), 1), "'bodies2world' must have shape"),
         (lambda: SceneRenderer("scene", WIDE), "'scene' must be a Scene"),  # type: ignore[arg-type]
         (lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).phasors(np.eye(3)), "'camera2world' must have shape"),

@@ -79,7 +79,13 @@ class PlacedScene:
 
         def bodies(placed: PlacedScene) -> list[tuple[Any, ...]]:
             found = placed.scene or ()
-            return [(body.name, np.asarray(body.albedo).tobytes(), body.mesh.vertices.tobytes()) for body in found]
+            return [
+                (
+                    *(body.name, body.retroreflecting, body.specular, body.shininess),
+                    *(np.asarray(body.albedo).tobytes(), body.mesh.vertices.tobytes()),
+                )
+                for body in found
+            ]
 
         return (
             bodies(self) == bodies(other)

@@ -15,11 +15,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.area_integral import Buffers, camera_poses, find_faces, of_poses, topology_of
+from phasemark.render.integral.area_integral import NO_LEAST, Buffers, camera_poses, find_faces, of_poses, topology_of
 from phasemark.render.integral.arguments import Camera, Poses, towards_landmark, towards_level
+from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import Intersector, make_intersector
-from phasemark.render.integral.light import landmark_hit
+from phasemark.render.integral.light import landmark_hit, reflected_by
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.quadrature_rules import G2W, G2X, G4W, G4X, gauss_legendre
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
@@ -177,15 +178,13 @@ class SceneMesh:
         # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
         radians_per_scale = 1.5
         fastest = radians_per_scale / scale[0] if behind else 0.0
-        while True:
-            reached, n = plan_rays(
-                0, mesh, pose, grid, 1, fastest, buffers.edges, buffers.scratch, buffers.samples, state, buffers.borders
-            )
-            if reached == 1:
-                break
-            buffers.make_room(reached)
+        n = self._planned(NO_LEAST, pose, grid, fastest, state, buffers)
+        if len(mesh.gloss):
+            least = np.ones((rows, cols, 2), np.int64)
+            count_highlight_boxes(n, buffers.samples, mesh, pose, grid, least)
+            if (least > 1).any():
+                n = self._planned(least, pose, grid, fastest, state, buffers)
         samples = buffers.samples
-        find_faces(n, samples, state, mesh, self._intersector, pose, grid)
         counts, corners = np.zeros(samples.pieces.placed[0], np.int64), np.empty((4, 3))
         more = _count_points(samples, mesh, pose, grid, scale, corners, counts)
         free = _count_free(state[0], pose, grid, background, scale) if behind else 0
@@ -197,6 +196,23 @@ class SceneMesh:
         if free:
             kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
         return tuple(column[:kept] for column in columns)
+
+    def _planned(
+        self, least: NDArray[np.int64], pose: Poses, grid: Camera, fastest: float, state: NDArray[np.uint8],
+        buffers: Buffers,
+    ) -> int:  # fmt: skip
+        """Place the samples of a pose, find what they see, and return how many there are."""
+        mesh = self.topology
+        while True:
+            reached, n = plan_rays(
+                0, mesh, pose, grid, 1, fastest, least, buffers.edges, buffers.scratch, buffers.samples, state,
+                buffers.borders,
+            )  # fmt: skip
+            if reached == 1:
+                break
+            buffers.make_room(reached)
+        find_faces(n, buffers.samples, state, mesh, self._intersector, pose, grid)
+        return int(n)
 
 
 def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float] = (0.0, 0.0)) -> SceneSamples:
@@ -354,7 +370,8 @@ def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, cor
                     own_y, own_z = y + G2X[k] * (y_far - y), z + G2X[k] * (z_far - z)
                     t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], own_y, own_z)
                     if t > 0.0:
-                        reflected *= mesh.albedo[face]
+                        length = math.sqrt(1.0 + own_y * own_y + own_z * own_z)
+                        reflected = reflected_by(mesh, face, 1.0, reflected, length)
                         kept = _keep(columns, kept, own_y, own_z, t, reflected, G2W[k] * weight, area, mesh.part[face])
         far = nearer
     _, _, amplitude, areas, _ = columns
@@ -398,7 +415,7 @@ def _hits(n, samples, counts, mesh, poses, camera, background, n_parts, scale, c
         t, reflected, seen = 0.0, 0.0, 0
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
-            reflected *= mesh.albedo[face]
+            reflected = reflected_by(mesh, face, 1.0, reflected, math.sqrt(1.0 + y * y + z * z))
             seen = mesh.part[face]
         elif behind:
             dx, dy, dz = towards_level(poses.level[0], y, z)

@@ -25,6 +25,7 @@ from phasemark.render.integral.arguments import (
     Samples,
     Sums,
 )
+from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import Intersector
 from phasemark.render.integral.lens_tables import distortion_of
@@ -50,6 +51,10 @@ _RETURNS = 1 << 9
 _BORDERS = 1 << 14
 _LINKS = 1 << 10
 """Further segments that a view is given room for when edges become chains behind a lens with distortion."""
+
+
+NO_LEAST = np.empty((0, 0, 2), np.int64)
+"""No pixel asks for more boxes than all."""
 
 
 @dataclass
@@ -243,7 +248,7 @@ class AreaIntegral:
             self.sensor.vignetting,
             _fastest(self.sensor),
         )
-        poses_per_task = min(64, -(-n // workers)) or 1
+        poses_per_task = 1 if len(self.topology.gloss) else min(64, -(-n // workers)) or 1
         tasks = [slice(i, min(i + poses_per_task, n)) for i in range(0, n, poses_per_task)]
         lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
 
@@ -276,16 +281,21 @@ class AreaIntegral:
                 columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
                 by_pixel = slopes.by_pixel[:, _pixels_of(task, sums)]
                 slope_sums = SlopeSums(by_pixel, columns, slopes.motion(task, poses, camera), own, slopes.turns)
-            view = 0
+            view, least = 0, NO_LEAST
             while view < len(poses.lens):
                 reached, n = plan_rays(
-                    view, mesh, poses, camera, self.splits, light.fastest, buffers.edges, buffers.scratch,
-                    buffers.samples, own.state, buffers.borders,
+                    view, mesh, poses, camera, self.splits, light.fastest, least, buffers.edges,
+                    buffers.scratch, buffers.samples, own.state, buffers.borders,
                 )  # fmt: skip
                 if reached <= view:
                     buffers.make_room(reached)
                     continue
                 find_faces(n, buffers.samples, own.state, mesh, self.intersector, poses, camera)
+                if len(mesh.gloss) and not len(least):  # one view, which is planned again where highlights are narrow
+                    least = np.ones((*own.state.shape[1:], 2), np.int64)
+                    count_highlight_boxes(n, buffers.samples, mesh, poses, camera, least)
+                    if (least > 1).any():
+                        continue
                 sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
                 if behind:
                     add_background(view, reached, poses, camera, light, own)
@@ -346,9 +356,9 @@ _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()
 
 def mesh_digest(mesh: SurfaceMesh) -> bytes:
     """Return a digest of all that a renderer asks of a mesh."""
-    attributes = [mesh.face_attributes.get(name, ()) for name in ("part", "albedo")]
+    attributes = [mesh.face_attributes.get(name, ()) for name in ("part", "albedo", "quadric")]
     digest = hashlib.blake2b()
-    for array in (mesh.vertices, mesh.faces, *attributes):
+    for array in (mesh.vertices, mesh.faces, *attributes, mesh.metadata.get("quadrics", ())):
         values = np.ascontiguousarray(array)
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(values.tobytes())

@@ -61,7 +61,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
         face = samples.face[k]
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[view], poses.matrix[view], y, z)
-            reflected *= light.albedo * mesh.albedo[face]
+            reflected = reflected_by(mesh, face, light.albedo, reflected, length)
             coverage += weights[k]
             sums.shares[index, mesh.part[face]] += weights[k]
         elif poses.background[view, 0] > 0.0 or poses.background[view, 1] > 0.0:
@@ -76,6 +76,19 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
         intensity += a
         returns.amplitude[k - start], returns.phase[k - start] = a, light.radians_per_metre * distance
     sums.intensity[index], sums.coverage[index] = intensity, coverage
+
+
+@kernel
+def reflected_by(mesh, face, albedo, facing, length):  # type: ignore[no-untyped-def]
+    """Return the response of a face times the length of the ray; `facing` is cos θ times that length.
+
+    ρ cos θ, and on glossy faces s_r + s N cosᵐ⁺¹ θ beside it, see :mod:`~phasemark.render.integral.gloss`.
+    """
+    lambertian = facing * (albedo * mesh.albedo[face])
+    if len(mesh.gloss) == 0:
+        return lambertian
+    gloss = mesh.gloss[face]
+    return lambertian + albedo * length * (gloss[0] + gloss[1] * (facing / length) ** (gloss[2] + 1.0))
 
 
 @kernel
@@ -137,11 +150,12 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
 
 @kernel
 def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return the multiple of the ray where it enters the face's quadric, and |cos θ| there times the ray's length.
+    """Return the multiple of the ray at its hit with the face's quadric, and |cos θ| there times the ray's length.
 
-    An outline is a chain of segments, some of which lie a hair outside: a ray that misses the quadric grazes it.
+    An outline is a chain that reaches a little beyond that of the quadric; a ray that misses it there grazes it. The
+    hit of a facet is whichever is nearer to it; the face of a solid has no plane, and is hit where the ray enters.
     """
-    q = mesh.quadrics[mesh.quadric[f]]
+    q, own = mesh.quadrics[mesh.quadric[f]], mesh.planes[f]
     gx = q[0] * dx + q[3] * dy + q[4] * dz
     gy = q[3] * dx + q[1] * dy + q[5] * dz
     gz = q[4] * dx + q[5] * dy + q[2] * dz
@@ -150,12 +164,15 @@ def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
     hz = q[4] * ox + q[5] * oy + q[2] * oz + q[8]
     a, b = dx * gx + dy * gy + dz * gz, dx * hx + dy * hy + dz * hz
     c = ox * (hx + q[6]) + oy * (hy + q[7]) + oz * (hz + q[8]) + q[9]
+    facing = own[0] * dx + own[1] * dy + own[2] * dz
     if a <= 0.0:  # along the axis of a cylinder
-        return 0.0, 0.0
+        return _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz) if facing != 0.0 else (0.0, 0.0)
     root = math.sqrt(max(b * b - a * c, 0.0))
-    t = (-b - root) / a
+    on_face = (own[3] - own[0] * ox - own[1] * oy - own[2] * oz) / facing if facing != 0.0 else 0.0
+    t = (-b - root) / a if a * on_face < -b else (-b + root) / a
     nx, ny, nz = hx + t * gx, hy + t * gy, hz + t * gz
-    return t, root / math.sqrt(nx * nx + ny * ny + nz * nz)
+    size = math.sqrt(nx * nx + ny * ny + nz * nz)
+    return t, root / size
 
 
 @kernel

@@ -19,6 +19,7 @@ from phasemark.render.integral.face_search import FaceGrid
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 
 CREASE_RAD = math.radians(30.0)
+NO_GLOSS = np.zeros((0, 3))
 CLUSTER = 32
 """Faces that are looked at together for silhouettes."""
 _HOLLOW = 1e-9
@@ -58,8 +59,10 @@ class MeshTopology(NamedTuple):
         number of the body.
     albedo : (f,) float64
         Of each face, relative to that of the surface.
+    gloss : (f, 3) float64
+        What faces return beside Lambertian light, see :mod:`~phasemark.render.integral.gloss`; without rows: nothing.
     quadric : (f,) int32
-        Which quadric the face is, −1 for none: then it is a triangle, or the plane face of a solid.
+        Which quadric is the true surface of the face, −1 for none.
     quadrics : (q, 10) float64
         A (xx, yy, zz, xy, xz, yz), b (3) and c of surfaces pᵀ A p + 2 b · p + c = 0, negative inside.
     closed : (f,) bool
@@ -109,6 +112,7 @@ class MeshTopology(NamedTuple):
     grid: FaceGrid
     part: NDArray[np.int32]
     albedo: NDArray[np.float64]
+    gloss: NDArray[np.float64]
     quadric: NDArray[np.int32]
     quadrics: NDArray[np.float64]
     closed: NDArray[np.bool_]
@@ -148,6 +152,7 @@ class MeshTopology(NamedTuple):
         faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
+        quadric = np.asarray(mesh.face_attributes.get("quadric", np.full(len(faces), -1)), dtype=np.int32)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -157,14 +162,14 @@ class MeshTopology(NamedTuple):
             raise UsageError("the mesh has no face with an area")
         kept = np.flatnonzero(kept)
         kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
-        faces, part, albedo, a = faces[kept], part[kept], albedo[kept], a[kept]
+        faces, part, albedo, quadric, a = faces[kept], part[kept], albedo[kept], quadric[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
         edges, regular = _edges(faces)
         first, other = edges[:, 2], edges[:, 3]
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
         crease = ~regular | (turn > crease_rad + 1e-9)
-        crease |= albedo[first] != albedo[other]
+        crease |= (albedo[first] != albedo[other]) | (quadric[first] != quadric[other])
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
@@ -173,7 +178,7 @@ class MeshTopology(NamedTuple):
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
         rise = np.einsum("ij,ij->i", planes[first, :3], off_edge) - planes[first, 3]
-        plain = np.bincount(patch, ~flat)[patch] == 0
+        plain = (np.bincount(patch, ~flat)[patch] == 0) | (quadric >= 0)  # one surface for the whole patch
         shares = _corner_shares(vertices[faces])
         apex = (corners == 0).all(axis=2).any(axis=1)
         hollow = np.bincount(patch[first], ~crease & (rise > _HOLLOW * extent), minlength=patch.max() + 1)[patch] > 0
@@ -201,8 +206,9 @@ class MeshTopology(NamedTuple):
             grid=FaceGrid.of_faces(vertices[faces], searched),
             part=np.ascontiguousarray(part),
             albedo=np.ascontiguousarray(albedo),
-            quadric=np.full(len(faces), -1, np.int32),
-            quadrics=np.zeros((0, 10)),
+            gloss=NO_GLOSS,
+            quadric=np.ascontiguousarray(quadric),
+            quadrics=np.asarray(mesh.metadata.get("quadrics", np.zeros((0, 10))), np.float64),
             closed=np.full(len(faces), closed),
             creases=np.ascontiguousarray(edges[crease], dtype=np.int32),
             concave=np.ascontiguousarray(rise[crease] > 0),
@@ -235,6 +241,7 @@ class MeshTopology(NamedTuple):
             grid=FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_)),
             part=np.zeros(0, np.int32),
             albedo=np.zeros(0),
+            gloss=NO_GLOSS,
             quadric=np.zeros(0, np.int32),
             quadrics=np.zeros((0, 10)),
             closed=np.zeros(0, np.bool_),

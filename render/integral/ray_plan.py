@@ -35,7 +35,7 @@ SHORT_SEGMENTS = -2
 
 @kernel
 def plan_rays(  # type: ignore[no-untyped-def]
-    first, mesh, poses, camera, splits, fastest, edges, scratch, samples, state, borders
+    first, mesh, poses, camera, splits, fastest, least, edges, scratch, samples, state, borders
 ):
     """Place the samples of as many views as fit into the buffers, from view `first` on.
 
@@ -49,6 +49,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
         Boxes a side that every pixel is cut into, at least.
     fastest : float
         As :class:`~phasemark.render.integral.arguments.Light` has it.
+    least : (rows, cols, 2) int64
+        Boxes along u and v that each pixel is cut into, at least; without rows: `splits` alone counts.
     edges : Edges
     scratch : Scratch
     samples : Samples
@@ -116,6 +118,8 @@ def plan_rays(  # type: ignore[no-untyped-def]
                 if turn > 0.5 * _TURN_RAD and (near_limb or head[r + 1, c + 1] >= 0):
                     parts_u, parts_v = max(parts_u, 2), max(parts_v, 2)
                 parts_u, parts_v = max(least_parts, parts_u), max(least_parts, parts_v)
+                if len(least) > 0:
+                    parts_u, parts_v = max(parts_u, least[row, c, 0]), max(parts_v, least[row, c, 1])
                 n, region, trusted = sample_pixel(
                     r, c, bent, parts_u, parts_v, camera, edges, scratch, samples, borders, n, region
                 )

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from phasemark.render.integral.components import component_labels
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 
-_Triangles = tuple[NDArray[np.float64], NDArray[np.int64]]
+_Triangles = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]
+_KEPT = ("albedo", "quadric")
+"""Attributes of faces that a union keeps."""
 
 
 def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
@@ -26,25 +28,28 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     Returns
     -------
     SurfaceMesh
-        Part labels are lost in a union; they follow from the height again.
+        A union keeps albedo and quadric of each face. Part labels are lost; they follow from the height again.
     """
     shells = _shells(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
     if len(shells) < 2:
         return mesh
-    if not _may_intersect(np.array([(points.min(axis=0), points.max(axis=0)) for points, _ in shells])):
+    if not _may_intersect(np.array([(points.min(axis=0), points.max(axis=0)) for points, _, _ in shells])):
         return mesh
     import trimesh  # takes a third of a second, and few meshes need it
 
-    if not all(trimesh.Trimesh(points, faces, process=False).is_volume for points, faces in shells):
+    if not all(trimesh.Trimesh(points, faces, process=False).is_volume for points, faces, _ in shells):
         return mesh
+    attributes = {name: np.asarray(mesh.face_attributes[name]) for name in _KEPT if name in mesh.face_attributes}
     solids = [
         manifold3d.Manifold(
             manifold3d.Mesh64(
                 vert_properties=np.ascontiguousarray(points, dtype=np.float64),
                 tri_verts=np.ascontiguousarray(faces, dtype=np.uint64),
+                # faces in one plane are merged unless each has a number
+                face_id=number.astype(np.uint64) if attributes else None,
             )
         )
-        for points, faces in shells
+        for points, faces, number in shells
     ]
     if any(solid.status() != manifold3d.Error.NoError for solid in solids):
         return mesh
@@ -52,21 +57,22 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     return trimesh.Trimesh(
         np.asarray(united.vert_properties)[:, :3],
         np.asarray(united.tri_verts, dtype=np.int64),
+        face_attributes={name: own[np.asarray(united.face_id, np.int64)] for name, own in attributes.items()},
         metadata=dict(mesh.metadata),
         process=False,
     )
 
 
 def _shells(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> list[_Triangles]:
-    """Split a mesh where no edge joins its faces; holes stay holes."""
+    """Split a mesh where no edge joins its faces: points, faces and their numbers; holes stay holes."""
     label = component_labels(len(faces), _adjacent_faces(faces))
     if not label.any():
-        return [(vertices, faces)]
+        return [(vertices, faces, np.arange(len(faces)))]
     order = np.argsort(label, kind="stable")
     shells = []
-    for own in np.split(faces[order], np.flatnonzero(np.diff(label[order])) + 1):
-        used, renumbered = np.unique(own, return_inverse=True)
-        shells.append((vertices[used], renumbered.reshape(-1, 3)))
+    for number in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        used, renumbered = np.unique(faces[number], return_inverse=True)
+        shells.append((vertices[used], renumbered.reshape(-1, 3), number))
     return shells
 
 

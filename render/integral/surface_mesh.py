@@ -25,6 +25,7 @@ class SurfaceMesh(Protocol):
         """What is known of faces.
 
         ``part``: 0 for faces of the lower part, 1 for faces of the upper one, (f,). ``albedo`` of each, (f,).
+        ``quadric``: the row of ``metadata["quadrics"]``, (q, 10), that is the true surface of a face, (f,); −1: none.
         """
 
     @property

@@ -18,6 +18,7 @@ from phasemark import UsageError
 from phasemark.render.integral.area_integral import mesh_digest
 from phasemark.render.integral.convex_parts import enter_parts, part_around
 from phasemark.render.integral.face_search import FaceGrid
+from phasemark.render.integral.gloss import gloss_row
 from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, in_lines
 from phasemark.render.integral.shells import unite_shells
@@ -161,6 +162,7 @@ class Assembly:
             grid=own[0].grid if alone else _NO_GRID,
             part=np.repeat(np.arange(len(own)), np.diff(first.face)).astype(np.int32),
             albedo=np.concatenate([mesh.albedo for mesh in own]),
+            gloss=np.concatenate([mesh.gloss for mesh in own]),
             quadric=np.concatenate(
                 [np.where(mesh.quadric >= 0, mesh.quadric + first.quadric[b], -1) for b, mesh in enumerate(own)]
             ).astype(np.int32),
@@ -274,7 +276,7 @@ class Assembly:
 def _inside(frame: int, name: str) -> UsageError:
     return UsageError(
         f"in frame {frame} the lens is inside body '{name}': move one of them, leave the body out, or, if it is a room,"
-        " turn its faces inward"
+        " take body.inside_out()"
     )
 
 
@@ -549,25 +551,28 @@ def _shell(body: Body, solid: Solid | None, own: MeshTopology) -> _Shell:
 
 
 def _analysed(bodies: Sequence[Body], solids: Sequence[Solid | None]) -> list[MeshTopology]:
-    """Analyse the mesh of each body, equal ones once."""
+    """Analyse each body, equal meshes once."""
     known: dict[tuple[bytes, bool], MeshTopology] = {}
+    glossy = any(body.is_glossy for body in bodies)
     found = []
     for body, solid in zip(bodies, solids, strict=True):
-        if solid is not None:
-            found.append(solid.topology(float(body.albedo)))
-            continue
-        mesh: Surface = Surface.of(body)
-        key = mesh_digest(mesh), body.smooth
-        if key not in known:
-            one_albedo = isinstance(body.albedo, float)
-            known[key] = MeshTopology.from_mesh(
-                unite_shells(mesh) if one_albedo else mesh, CREASE_RAD if body.smooth else 0.0
-            )
-        topology = known[key]
+        topology = _analysed_mesh(body, known) if solid is None else solid.topology()
         if isinstance(body.albedo, float):
             topology = topology._replace(albedo=np.full(len(topology.faces), body.albedo))
+        if glossy:
+            row = gloss_row(body.retroreflecting, body.specular, body.shininess)
+            topology = topology._replace(gloss=np.tile(row, (len(topology.faces), 1)))
         found.append(topology)
     return found
+
+
+def _analysed_mesh(body: Body, known: dict[tuple[bytes, bool], MeshTopology]) -> MeshTopology:
+    """Analyse the mesh of a body, or return what is known of it."""
+    mesh: Surface = Surface.of(body)
+    key = mesh_digest(mesh), body.smooth
+    if key not in known:
+        known[key] = MeshTopology.from_mesh(unite_shells(mesh), CREASE_RAD if body.smooth else 0.0)
+    return known[key]
 
 
 def _shifted(creases: NDArray[np.int32], vertex: int, face: int) -> NDArray[np.int64]:

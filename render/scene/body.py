@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -12,11 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.integral.surface_mesh import SurfaceMesh
-from phasemark.render.rigid import rigid_transforms
+from phasemark.render.rigid import product, rigid_transforms
 from phasemark.render.scene.solids import Solid
 
 SEGMENTS = 96
 """Sides of the polygon that stands for a circle."""
+_SHARPEST = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,12 @@ class Surface:
         attributes: dict[str, Any] = {"part": np.zeros(len(body.mesh.faces), np.int32)}
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
-        return cls(np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes)
+        metadata: dict[str, Any] = {}
+        if body.smooth and body.quadrics is not None:
+            attributes["quadric"], metadata["quadrics"] = body.quadrics
+        return cls(
+            np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, metadata
+        )
 
 
 _CORNER = (math.pi / SEGMENTS) / math.sin(math.pi / SEGMENTS)
@@ -49,18 +56,30 @@ class Primitive(NamedTuple):
     solid : Solid
     face : (f,) int64
         The face of the solid that each triangle stands for.
-    vertices : (v, 3) float64
+    vertices, faces : (v, 3) float64, (f, 3) int64
         Of the mesh that was made of it.
     """
 
     solid: Solid
     face: NDArray[np.int64]
     vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def is_of(self, mesh: SurfaceMesh) -> bool:
+        """Return True if a mesh is still the one that was made."""
+        return np.array_equal(mesh.vertices, self.vertices) and np.array_equal(mesh.faces, self.faces)
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """A rigid Lambertian body.
+    """A rigid body, Lambertian unless it is given gloss.
+
+    With lamp and lens in one place a face that is met at the angle θ returns
+
+        a = [ ρ cos θ + s_r + s N(m) cosᵐ⁺¹ θ ] / r²,    N(m) = (m + 2)(m + 4) / (8 (m + 2^(−m/2)))
+
+    of albedo ρ, `retroreflecting` s_r, `specular` s and `shininess` m: Lambert's law, sheeting that returns light along
+    the incident ray, and Blinn-Phong's lobe, normalised.
 
     Parameters
     ----------
@@ -75,14 +94,24 @@ class Body:
     smooth : bool
         Whether normals are interpolated between faces that meet at less than 30°, as on a mesh that stands for a curved
         surface; False: every facet is flat.
+    quadrics : tuple, optional
+        Of round meshes: which quadric is the true surface of each face, (f,) int32, −1 for none, and the quadrics,
+        (q, 10), as :class:`~phasemark.render.integral.mesh_topology.MeshTopology` has them.
     primitive : Primitive, optional
         What the mesh stands for: the box, ellipsoid, cylinder or capsule that it was made of is rendered in its place
         as long as nobody changes the mesh, or its facets (`albedo` of each, `smooth`).
+    retroreflecting : float
+        s_r, at all angles: 1 is a white Lambertian face seen head on, and sheeting returns hundreds.
+    specular : float
+        s, the share of light from straight ahead that the lobe about the mirror direction reflects.
+    shininess : float
+        m, 1 … 1000: cosᵐ θ falls to a half at θ = 1.18 / √m.
 
     Raises
     ------
     UsageError
-        The mesh has no faces, a vertex is not finite, an albedo is out of range, or the pose is not rigid.
+        The mesh has no faces, a vertex is not finite, an albedo is out of range, or the pose is not rigid; gloss is out
+        of range, or a body's albedo and `specular` together are above 1.
 
     Examples
     --------
@@ -97,7 +126,11 @@ class Body:
     name: str = ""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     smooth: bool = True
+    quadrics: tuple[NDArray[np.int32], NDArray[np.float64]] | None = field(default=None, repr=False)
     primitive: Primitive | None = field(default=None, repr=False)
+    retroreflecting: float = 0.0
+    specular: float = 0.0
+    shininess: float = 32.0
 
     def __post_init__(self) -> None:
         if not (hasattr(self.mesh, "vertices") and hasattr(self.mesh, "faces")):
@@ -109,7 +142,14 @@ class Body:
             raise UsageError(f"{self._who}: vertex {int(np.argmin(np.isfinite(vertices).all(axis=1)))} is not finite")
         if faces.min() < 0 or faces.max() >= len(vertices):
             raise UsageError(f"{self._who}: a face names a vertex that is not there, counted from 0")
-        albedo = np.asarray(self.albedo, np.float64)
+        corners = vertices[faces]
+        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        if not (area > 1e-14 * np.ptp(vertices, axis=0).max() ** 2).any():  # as MeshTopology drops faces
+            raise UsageError(f"{self._who}: no face of the mesh has an area")
+        try:
+            albedo = np.asarray(self.albedo, np.float64)
+        except (TypeError, ValueError):
+            raise UsageError(f"{self._who}: 'albedo' must be numbers, got {self.albedo!r}") from None
         if albedo.shape not in ((), (len(faces),)):
             raise UsageError(
                 f"{self._who}: 'albedo' must be a number or one for each of {len(faces)} faces, got {albedo.shape}"
@@ -117,8 +157,28 @@ class Body:
         wrong = albedo[~((albedo >= 0) & (albedo <= 1))]
         if wrong.size:
             raise UsageError(f"{self._who}: 'albedo' must be in [0, 1], got {wrong.flat[0]:g}")
+        self._check_gloss(float(albedo.max()))
         object.__setattr__(self, "albedo", float(albedo) if albedo.ndim == 0 else albedo)
         object.__setattr__(self, "pose", rigid_transforms(self.pose, f"pose of {self._who}")[0])
+
+    def _check_gloss(self, albedo: float) -> None:
+        """Refuse gloss that is out of range, or that reflects more than comes in."""
+        bounds = {"retroreflecting": (0.0, math.inf), "specular": (0.0, 1.0), "shininess": (1.0, _SHARPEST)}
+        for name, (low, high) in bounds.items():
+            value = getattr(self, name)
+            if not (isinstance(value, (int, float, np.number)) and math.isfinite(value) and low <= value <= high):
+                allowed = f"in [{low:g}, {high:g}]" if math.isfinite(high) else "finite and at least 0"
+                raise UsageError(f"{self._who}: '{name}' must be {allowed}, got {value!r}")
+        rounding = 1e-9
+        if self.specular > 0 and albedo + self.specular > 1 + rounding:
+            raise UsageError(
+                f"{self._who}: 'albedo' and 'specular' together must be at most 1, got {albedo:g} + {self.specular:g}"
+            )
+
+    @property
+    def is_glossy(self) -> bool:
+        """Whether the body returns more than Lambertian light."""
+        return self.retroreflecting > 0 or self.specular > 0
 
     @property
     def _who(self) -> str:
@@ -136,11 +196,71 @@ class Body:
         own = self.primitive
         if own is None or not (self.smooth and isinstance(self.albedo, float)):
             return None
-        return own.solid if np.array_equal(self.mesh.vertices, own.vertices) else None
+        return own.solid if own.is_of(self.mesh) else None
 
     def named(self, name: str) -> Body:
         """Return the body under another name."""
         return replace(self, name=name)
+
+    def with_gloss(self, *, retroreflecting: float = 0.0, specular: float = 0.0, shininess: float = 32.0) -> Body:
+        """Return the body with a retroreflecting or specular share, see the class.
+
+        Examples
+        --------
+        >>> from phasemark.render import Body
+        >>> Body.sphere(0.1, albedo=0.4).with_gloss(specular=0.1, shininess=50.0).is_glossy
+        True
+        """
+        return replace(self, retroreflecting=retroreflecting, specular=specular, shininess=shininess)
+
+    def inside_out(self) -> Body:
+        """Return the body with its faces turned over, as a room that is seen from inside.
+
+        Examples
+        --------
+        >>> from phasemark.render import Body
+        >>> room = Body.box((5.0, 4.0, 2.5), albedo=0.6, name="room").inside_out()
+        """
+        vertices, faces = np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)
+        return replace(self, mesh=trimesh.Trimesh(vertices, faces[:, ::-1], process=False))
+
+    @classmethod
+    def joined(cls, bodies: Iterable[Body], name: str = "") -> Body:
+        """Return bodies as one in the frame in which they stand: where solids run through one another, they unite.
+
+        Parameters
+        ----------
+        bodies : iterable of Body
+        name : str
+
+        Raises
+        ------
+        UsageError
+            There is none, or they differ in `smooth` or in gloss.
+        """
+        parts = list(bodies)
+        if len({(part.smooth, part.retroreflecting, part.specular, part.shininess) for part in parts}) != 1:
+            raise UsageError("bodies that are joined must be at least one, and agree in 'smooth' and in gloss")
+        n_faces = [len(part.mesh.faces) for part in parts]
+        first = np.cumsum([0, *(len(part.mesh.vertices) for part in parts)])
+        vertices = [trimesh.transform_points(np.asarray(part.mesh.vertices), part.pose) for part in parts]
+        faces = [np.asarray(part.mesh.faces) + begin for part, begin in zip(parts, first, strict=False)]
+        albedo = np.concatenate([np.broadcast_to(part.albedo, n) for part, n in zip(parts, n_faces, strict=True)])
+        which, quadrics = [], [np.zeros((0, 10))]
+        for part, n in zip(parts, n_faces, strict=True):
+            own, known = part.quadrics or (np.full(n, -1), quadrics[0])
+            which.append(np.where(own >= 0, own + sum(map(len, quadrics)), -1))
+            quadrics.append(turned_quadrics(known, part.pose[:3, :3].T, part.pose[:3, 3]))
+        one = (albedo == albedo[0]).all()
+        return replace(
+            parts[0],
+            mesh=trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False),
+            albedo=float(albedo[0]) if one else albedo,
+            name=name,
+            pose=np.eye(4),
+            quadrics=(np.concatenate(which).astype(np.int32), np.concatenate(quadrics)),
+            primitive=None,
+        )
 
     @classmethod
     def box(cls, size_m: ArrayLike, *, albedo: float = 0.8, name: str = "", pose: ArrayLike | None = None) -> Body:
@@ -303,15 +423,31 @@ class Body:
         face: ArrayLike = (),
     ) -> Body:
         """Return a body of a mesh that stands for a solid."""
-        own = None
+        true, own = None, None
         if solid is not None:
-            own = Primitive(solid, np.asarray(face, np.int64), np.array(mesh.vertices, np.float64))
-        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), primitive=own)
+            number = np.asarray(face, np.int64)
+            true = solid.quadric[number], solid.quadrics
+            own = Primitive(solid, number, np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
+        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), quadrics=true, primitive=own)
+
+
+def turned_quadrics(
+    quadrics: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return quadrics, (q, 10), of a body that was turned and moved."""
+    square = product(product(transposed.T, quadrics[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]), transposed)
+    own = product(quadrics[:, None, 6:9], transposed)[:, 0]
+    linear = own - product(square, offset[:, None])[..., 0]
+    constant = quadrics[:, 9] - product((linear + own)[:, None], offset[:, None])[:, 0, 0]
+    return np.column_stack([square[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], linear, constant])
 
 
 def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:
     """Return n positive lengths."""
-    found = np.asarray(values, np.float64)
+    try:
+        found = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        found = np.empty(0)
     if found.shape != (n,) or not (np.isfinite(found) & (found > 0)).all():
         raise UsageError(f"'{name}' must be {n} positive number{'s' * (n > 1)} of metres, got {values!r}")
     return found

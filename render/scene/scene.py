@@ -169,7 +169,11 @@ class Scene:
             raise UsageError(
                 f"'bodies2world' must have shape ({len(self)}, 4, 4) or ({n}, {len(self)}, 4, 4), got {array.shape}"
             )
-        rigid_transforms(array.reshape(-1, 4, 4), "bodies2world")
+        try:
+            rigid_transforms(array.reshape(-1, 4, 4), "bodies2world")
+        except UsageError:
+            for b, name in enumerate(self.names):
+                rigid_transforms(array.reshape(-1, len(self), 4, 4)[:, b], f"pose of body '{name}'")
         poses[:] = array
         return poses
 

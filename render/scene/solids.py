@@ -131,7 +131,7 @@ class Solid(NamedTuple):
             curves=np.array([[*curve, 0] for curve in curves], np.float64),
         )
 
-    def topology(self, albedo: float) -> MeshTopology:
+    def topology(self) -> MeshTopology:
         """Return the surface as the area integral asks for it; its faces have no corners."""
         n = len(self.planes)
         return MeshTopology.empty()._replace(
@@ -145,7 +145,7 @@ class Solid(NamedTuple):
             searched=np.zeros(n, np.bool_),
             search=np.zeros((n, 16), np.float32),
             part=np.zeros(n, np.int32),
-            albedo=np.full(n, albedo),
+            albedo=np.ones(n),
             quadric=self.quadric,
             quadrics=self.quadrics,
             closed=np.ones(n, np.bool_),

@@ -14,13 +14,25 @@ LIGHT_M_PER_S = 299_792_458.0
 
 
 class Solid(NamedTuple):
-    """A box (half sides), a sphere (radius) or a capsule (radius, half height), and where it stands."""
+    """A box (half sides), a sphere (radius) or a capsule (radius, half height), and where it stands.
+
+    Its gloss is a retroreflecting share, a share of Blinn and Phong's lobe, and the lobe's exponent.
+    """
 
     kind: str
     size: tuple[float, ...]
     rotation: Array
     place: Array
     albedo: float
+    gloss: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+    def response(self, cosine: Array) -> Array:
+        """Return π times the BRDF back to the lamp, times cos θ."""
+        retroreflecting, specular, exponent = self.gloss
+        away = np.linspace(0, np.pi / 2, 100_001)  # from the normal, for light that comes along it
+        lobe = np.cos(away / 2) ** exponent * np.cos(away) * np.sin(away) * 2 * np.pi
+        whole = float(((lobe[1:] + lobe[:-1]) / 2).sum() * away[1])
+        return self.albedo * cosine + retroreflecting + specular * np.pi / whole * cosine ** (exponent + 1)
 
 
 def first_hits(solids: list[Solid], lens: Array, rays: Array) -> tuple[Array, NDArray[np.int64], Array]:
@@ -48,9 +60,11 @@ def pixels(
             rays = rays @ camera2world[:3, :3].T / np.linalg.norm(rays, axis=1, keepdims=True)
             along, which, cosine = first_hits(solids, camera2world[:3, 3], rays)
             met = which >= 0
-            albedo = np.array([solid.albedo for solid in solids])[which[met]]
+            response = np.zeros(len(rays))
+            for number, solid in enumerate(solids):
+                response[which == number] = solid.response(cosine[which == number])
             phase = 4 * math.pi * hz / LIGHT_M_PER_S * along[met]
-            phasor[row, col] = (albedo * cosine[met] / along[met] ** 2 * np.exp(1j * phase)).sum() / n**2
+            phasor[row, col] = (response[met] / along[met] ** 2 * np.exp(1j * phase)).sum() / n**2
             shares[row, col] = np.bincount(which[met], minlength=len(solids)) / n**2
     return phasor, shares
 
