@@ -10,7 +10,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
 
 import numpy as np
 import trimesh
@@ -135,6 +135,31 @@ class PlanModel(BaseModel):
         return self
 
 
+class _NamesSensor(Protocol):
+    """Fields of a plan that names a sensor, each in its own place among the others."""
+
+    @property
+    def sensor(self) -> str: ...
+    @property
+    def sensor_overrides(self) -> dict[str, Any]: ...
+
+
+class SensorPlan(PlanModel):
+    """A plan with the fields `sensor` and `sensor_overrides`."""
+
+    def build_sensor(self: _NamesSensor) -> Sensor:
+        """Return the sensor, overrides applied.
+
+        Raises
+        ------
+        UsageError
+            The preset is unknown, or a field or its value is wrong.
+        InputFileError
+            The sensor file cannot be read.
+        """
+        return sensor_of(self.sensor, self.sensor_overrides)
+
+
 class MeshPlan(PlanModel):
     """A landmark from a mesh file.
 
@@ -176,7 +201,7 @@ class MeshPlan(PlanModel):
         return read_mesh(self.path, unit=self.unit, up=self.up, origin=self.origin)
 
 
-class ScenePlan(PlanModel, ABC):
+class ScenePlan(SensorPlan, ABC):
     """Landmarks and camera of a plan.
 
     Parameters
@@ -211,18 +236,6 @@ class ScenePlan(PlanModel, ABC):
     @abstractmethod
     def greatest_distances_m(self) -> dict[str, float]:
         """Return the greatest distance that each key of the plan asks for, metres."""
-
-    def build_sensor(self) -> Sensor:
-        """Return the sensor, overrides applied.
-
-        Raises
-        ------
-        UsageError
-            The preset is unknown, or a field or its value is wrong.
-        InputFileError
-            The sensor file cannot be read.
-        """
-        return sensor_of(self.sensor, self.sensor_overrides)
 
     def resolve_landmarks(self) -> tuple[list[LandmarkSpec], list[MeshPlan]]:
         """Return the landmarks, those of the catalogue spelled out, and those from mesh files.

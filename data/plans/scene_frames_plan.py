@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data.files.narrow import narrowed
-from phasemark.data.plans.bank_plan import PlanModel, plan_of_table, sensor_in_folder, sensor_of, without_nul
+from phasemark.data.plans.bank_plan import PlanModel, SensorPlan, plan_of_table, sensor_in_folder, without_nul
 from phasemark.data.plans.frame_plan import (
     FramePlan,
     FramesPerView,
@@ -37,7 +37,6 @@ from phasemark.data.plans.generated_scene import (
 )
 from phasemark.data.seeds import stream
 from phasemark.inputs.toml_file import read_toml
-from phasemark.render import Sensor
 
 _Finite = Annotated[float, Field(allow_inf_nan=False)]
 _ClassName = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_. -]*$", max_length=100)]
@@ -140,7 +139,7 @@ class ScenesTable(PlanModel):
         return self
 
 
-class SceneFramesPlan(PlanModel):
+class SceneFramesPlan(SensorPlan):
     """A frame set of scenes: noisy frames with poses, labels, shares of bodies and the range without noise.
 
     Each step of a scene is a view.
@@ -224,18 +223,6 @@ class SceneFramesPlan(PlanModel):
     def has_histograms(self) -> bool:
         """Whether the sensor counts photons in bins."""
         return self.build_sensor().histogram is not None
-
-    def build_sensor(self) -> Sensor:
-        """Return the sensor, overrides applied.
-
-        Raises
-        ------
-        UsageError
-            The preset is unknown, or a field or its value is wrong.
-        InputFileError
-            The sensor file cannot be read.
-        """
-        return sensor_of(self.sensor, self.sensor_overrides)
 
     def greatest_distances_m(self) -> dict[str, float]:
         """Return nothing: a plan of scenes does not say how far bodies are."""
