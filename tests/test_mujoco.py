@@ -11,13 +11,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from oracles.mujoco_rays import ray_images, ray_targets_m
 
-from phasemark import UsageError
-from phasemark.render import preset
+from phasemark import InputFileError, UsageError
+from phasemark.render import Scene, preset
 from phasemark.render.direct import HistogramFrames
+from phasemark.render.scene.mujoco_scene import seen_model
 from phasemark.render.simulators.cadence import Cadence
 from phasemark.render.simulators.gymnasium import TofObservation
 from phasemark.render.simulators.mujoco import TofSensor
-from phasemark.render.simulators.mujoco_scene import seen_model
 
 AHEAD = 'xyaxes="0 -1 0 0 0 1"'  # a MuJoCo camera that looks along x of the world
 WALL = '<geom name="wall" type="box" size=".05 4 4" pos="2.05 0 0" rgba=".5 .5 .5 .9"/>'
@@ -160,6 +160,22 @@ def test_albedo_is_luminance_one_number_or_that_of_names():
     model = in_mujoco(world, materials)[0].model
     of = [seen_model(model, albedo, -1, (0,), True) for albedo in ("rgba", 0.3, {"a": 0.1})]
     assert [[body.albedo for body in one.scene] for one in of] == [[0.7152, 0.5], [0.3, 0.3], [0.1, 0.5]]
+
+
+def test_a_file_of_a_model_becomes_a_scene(tmp_path):
+    file = tmp_path / "hall.xml"
+    file.write_text(
+        '<mujoco><worldbody><geom type="plane" size="2 2 1" rgba=".5 .5 .5 1"/><body name="ball" pos="1 0 .3">'
+        '<freejoint/><geom size=".1" rgba="1 1 1 1"/><geom type="box" size=".1 .1 .1" group="3"/></body>'
+        "</worldbody></mujoco>"
+    )
+    scene = Scene.read(file)
+    assert scene.names == ("world", "ball")
+    assert scene["ball"].albedo == 1.0
+    np.testing.assert_allclose(scene["ball"].pose[:3, 3], [1, 0, 0.3], atol=1e-6)
+    file.write_text('<mujoco><worldbody><geom type="blob" size="1"/></worldbody></mujoco>')
+    with pytest.raises(InputFileError, match=r"hall\.xml: MuJoCo cannot read it: XML Error: invalid keyword: 'blob'"):
+        Scene.read(file)
 
 
 def test_solids_of_a_body_that_overlap_are_one_without_inner_edges():
@@ -314,10 +330,11 @@ def test_wrong_states_end_in_one_line():
 
 
 @pytest.mark.parametrize(
-    ("missing", "module"), [("mujoco", "mujoco"), ("mujoco", "mujoco_scene"), ("gymnasium", "gymnasium")]
+    ("missing", "module"),
+    [("mujoco", "simulators.mujoco"), ("mujoco", "scene.mujoco_scene"), ("gymnasium", "simulators.gymnasium")],
 )
 def test_without_the_package_the_extra_is_named(missing, module, monkeypatch):
-    module = f"phasemark.render.simulators.{module}"
+    module = f"phasemark.render.{module}"
     monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, missing, None)
     with pytest.raises(UsageError, match=rf"need.* the package {missing}: pip install -e '\.\[mujoco\]'"):

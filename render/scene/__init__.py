@@ -12,4 +12,6 @@ if TYPE_CHECKING:
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 
+NEEDS_MUJOCO = "MuJoCo's models need the package mujoco: pip install -e '.[mujoco]' in the clone of phasemark"
+
 __all__ = ["Body", "DepthZones", "Scene", "SceneRenderer", "zones_from_depth"]

@@ -118,27 +118,36 @@ class Scene:
 
     @classmethod
     def read(cls, path: str | Path, *, albedo: float | None = None) -> Scene:
-        """Return a scene of a file that trimesh reads: glTF, GLB, OBJ with materials, PLY and others, in metres.
+        """Return a scene of a file: glTF, GLB, OBJ with materials, PLY and others that trimesh reads, URDF or MJCF.
 
         Parameters
         ----------
         path : path
+            In metres. Of a URDF the visual geometry of each link is a body, named as the link, with all joints at 0.
+            An MJCF file (.xml) needs the extra ``[mujoco]``; its geoms are seen as in MuJoCo's viewer, at the first
+            positions of its joints.
         albedo : float, optional
             As for :meth:`of_trimesh`.
 
         Raises
         ------
         InputFileError
-            The file is missing or cannot be read.
+            The file is missing, cannot be read or holds no mesh.
+        UsageError
+            The package that a format needs is not installed.
         """
         path = Path(path)
         if not path.is_file():
             raise InputFileError(f"{path}: there is no such file")
-        try:
-            loaded = trimesh.load_scene(path)
-        except Exception as error:  # whatever one of a dozen readers raises
-            raise InputFileError(f"{path}: cannot be read as a scene ({type(error).__name__}: {error})") from None
-        return cls.of_trimesh(loaded, albedo=albedo)
+        if path.suffix.lower() == ".urdf":
+            from phasemark.render.scene.urdf import links_of_urdf
+
+            return cls(links_of_urdf(path, albedo))
+        if path.suffix.lower() in (".xml", ".mjcf"):
+            from phasemark.render.scene.mujoco_scene import scene_of_mjcf
+
+            return scene_of_mjcf(path, albedo)
+        return cls.of_trimesh(loaded_meshes(path), albedo=albedo)
 
     def posed(self, bodies2world: ArrayLike | dict[str, ArrayLike] | None, n: int) -> NDArray[np.float64]:
         """Return where the bodies stand in each of n frames, (n, b, 4, 4).
@@ -176,6 +185,23 @@ class Scene:
                 rigid_transforms(array.reshape(-1, len(self), 4, 4)[:, b], f"pose of body '{name}'")
         poses[:] = array
         return poses
+
+
+def loaded_meshes(path: Path) -> trimesh.Scene:
+    """Return the meshes that trimesh reads of a file.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be read, or holds no mesh.
+    """
+    try:
+        loaded = trimesh.load_scene(path)
+    except Exception as error:  # whatever one of a dozen readers raises
+        raise InputFileError(f"{path}: cannot be read as a scene ({type(error).__name__}: {error})") from None
+    if not any(isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) for mesh in loaded.geometry.values()):
+        raise InputFileError(f"{path}: holds no mesh with faces")
+    return loaded
 
 
 def _without_scale(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

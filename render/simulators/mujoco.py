@@ -15,13 +15,13 @@ from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.frames import Frames
 from phasemark.render.phasor_images import PhasorImages
+from phasemark.render.scene import NEEDS_MUJOCO
+from phasemark.render.scene.mujoco_scene import body_name, seen_model
 from phasemark.render.scene.scene_renderer import SceneRenderer
 from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.shipped_sensors import preset
-from phasemark.render.simulators import NEEDS_MUJOCO
 from phasemark.render.simulators.cadence import Cadence
-from phasemark.render.simulators.mujoco_scene import body_name, seen_model
 
 try:
     import mujoco

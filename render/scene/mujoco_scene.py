@@ -5,18 +5,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from phasemark import UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.render.integral.components import component_labels
 from phasemark.render.rigid import product
+from phasemark.render.scene import NEEDS_MUJOCO
 from phasemark.render.scene.body import Body
 from phasemark.render.scene.scene import Scene
-from phasemark.render.simulators import NEEDS_MUJOCO
 
 try:
     import mujoco
@@ -114,9 +115,7 @@ def seen_model(
     for geoms in _together(model, seen, own, smooth):
         body, pose = geoms[0][1], _local(model, geoms[0][0])
         if len(geoms) > 1:
-            parts = [_moved(shape, _local(model, g)) for g, shape in geoms]
-            whole: Any = trimesh.util.concatenate(parts)
-            body, pose = replace(body, mesh=whole), np.eye(4)
+            body, pose = Body.joined([replace(shape, pose=_local(model, g)) for g, shape in geoms]), np.eye(4)
         g = geoms[0][0]
         name = body_name(model, int(model.geom_bodyid[g]))
         if any(other.name == name for other in bodies):
@@ -130,6 +129,23 @@ def seen_model(
     mujoco.mj_kinematics(model, data)  # what never moves stands where it is from the start
     posed = [replace(body, pose=pose) for body, pose in zip(bodies, found.poses(data, np.zeros(3)), strict=True)]
     return replace(found, scene=Scene(posed))
+
+
+def scene_of_mjcf(path: Path, albedo: float | None) -> Scene:
+    """Return the geoms that MuJoCo's viewer shows of a model in a file, at the first positions of its joints.
+
+    Raises
+    ------
+    InputFileError
+        MuJoCo cannot read the file.
+    UsageError
+        As :func:`seen_model` does.
+    """
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise InputFileError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from None
+    return seen_model(model, "rgba" if albedo is None else albedo, -1, (0, 1, 2), True).scene
 
 
 def _together(
