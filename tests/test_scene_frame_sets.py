@@ -312,7 +312,7 @@ def test_a_plan_that_cannot_be_is_refused_by_its_key(scenes: dict[str, Any], mes
         ("returns_a_scene", {}, "scene 0: the generator .* must return a GeneratedScene, got an object of type Scene"),
         ("returns_none", {}, "scene 0: the generator .* must return a GeneratedScene, got None"),
         ("nan_pose", {}, "scene 0: 'camera2world' must be finite"),
-        ("nan_body", {}, "scene 0: 'bodies2world' must be finite"),
+        ("nan_body", {}, "scene 0: pose of body 'wall' must be finite"),
         (
             "raises_at_3",
             {},
