@@ -199,31 +199,14 @@ class Assembly:
         """Find the curves along which bodies that moved pass through any other."""
         gone = set(moved.tolist())
         self._curves = {pair: found for pair, found in self._curves.items() if gone.isdisjoint(pair)}
-        done = np.zeros(len(self._own), np.bool_)
-        for b in moved:
-            meets = ((self._bounds[b, 0] < self._bounds[:, 1]) & (self._bounds[:, 0] < self._bounds[b, 1])).all(axis=1)
-            done[b] = True
-            for other in np.flatnonzero(meets & ~done):
-                one, two = sorted((int(b), int(other)))  # the same curves to the last bit, whichever moved
-                if self._apart(one, two):
-                    continue
-                (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
-                ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
-                if len(ends):
-                    pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]])
-                    self._curves[one, two] = ends, pairs + self._first.face[[one, two]]
-
-    def _apart(self, one: int, two: int) -> bool:
-        """Return whether balls around the parts of two bodies keep apart; a mesh is one part."""
-        balls = []
-        for b in (one, two):
-            own = self._base.balls[slice(*self._first.part[b : b + 2])]
-            if not len(own):
-                low, high = self._bounds[b]
-                own = np.array([[*(low + high) / 2, np.linalg.norm(high - low) / 2]])
-            balls.append(own)
-        away = np.linalg.norm(balls[0][:, None, :3] - balls[1][None, :, :3], axis=-1)
-        return bool((away > balls[0][:, None, 3] + balls[1][None, :, 3]).all())
+        has_moved = np.zeros(len(self._own), np.bool_)
+        has_moved[moved] = True
+        for one, two in _close_pairs(self._base, has_moved, self._bounds, self._first.part):
+            (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
+            ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
+            if len(ends):
+                pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]])
+                self._curves[int(one), int(two)] = ends, pairs + self._first.face[[one, two]]
 
     def _placed_shell(self, b: int) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
         """Return the triangles of a body where it stands, and the face of the body that each of them stands for."""
@@ -450,6 +433,58 @@ def _turn_bodies(moved, poses, first, own, placed, bounds):  # type: ignore[no-u
                 for k in range(3):
                     bounds[b, 0, k] = min(bounds[b, 0, k], placed.balls[p, k] - placed.balls[p, 3])
                     bounds[b, 1, k] = max(bounds[b, 1, k], placed.balls[p, k] + placed.balls[p, 3])
+
+
+def _close_pairs(
+    mesh: MeshTopology, moved: NDArray[np.bool_], bounds: NDArray[np.float64], first: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return pairs of bodies, (p, 2), lower first, that may pass through one another and at least one of which moved."""
+    room = 256
+    while True:
+        pairs = np.empty((room, 2), np.int64)
+        n = _fill_close_pairs(mesh, moved, bounds, first, pairs)
+        if n <= room:
+            return pairs[:n]
+        room = n
+
+
+@njit(cache=True)
+def _fill_close_pairs(mesh, moved, bounds, first, pairs):  # type: ignore[no-untyped-def]
+    """Write the pairs; return how many there are, also beyond the room for them."""
+    count = 0
+    for i in range(len(moved)):
+        for j in range(i + 1, len(moved)):
+            if not (moved[i] or moved[j]):
+                continue
+            apart = False
+            for k in range(3):
+                apart = apart or bounds[i, 0, k] >= bounds[j, 1, k] or bounds[j, 0, k] >= bounds[i, 1, k]
+            if apart:
+                continue
+            meet = first[i] == first[i + 1] or first[j] == first[j + 1]  # a mesh has no parts to be asked
+            for p in range(first[i], first[i + 1]):
+                for q in range(first[j], first[j + 1]):
+                    meet = meet or not (_beyond(mesh, p, mesh.balls[q]) or _beyond(mesh, q, mesh.balls[p]))
+            if meet:
+                if count < len(pairs):
+                    pairs[count, 0], pairs[count, 1] = i, j
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def _beyond(mesh, part, ball):  # type: ignore[no-untyped-def]
+    """Return whether a ball is beyond a plane of a convex part, or apart from the ball around it."""
+    own, square = mesh.balls[part], 0.0
+    for k in range(3):
+        square += (ball[k] - own[k]) ** 2
+    if square > (ball[3] + own[3]) ** 2:
+        return True
+    for f in range(mesh.parts[part, 0], mesh.parts[part, 1]):
+        plane = mesh.planes[f]
+        if plane[0] * ball[0] + plane[1] * ball[1] + plane[2] * ball[2] - plane[3] > ball[3]:
+            return True
+    return False
 
 
 @njit(cache=True)
