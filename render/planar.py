@@ -180,6 +180,8 @@ def planar_images(
     intensity = np.where(seen, albedo * cos_incidence / distance**2, 0.0)
     if sensor.vignetting:
         intensity *= sensor.pixel_directions()[first:stop, :, 0] ** 4
+    if sensor.lamp_shapes_light:
+        intensity *= sensor.lamp_intensity(sensor.axis_cosine()[first:stop])
     phase = np.where(seen, distance, 0.0) / sensor.metres_per_radian
     first_hz, all_hz = sensor.frequencies_hz[0], phasor_frequencies_hz(sensor.frequencies_hz, harmonics)
     return PhasorImages(

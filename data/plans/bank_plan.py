@@ -51,6 +51,8 @@ DEFAULT_MARGIN_DEG = 5.0
 _YOUNGER_FIELDS = {
     "lens",
     "histogram",
+    "lamp_half_angle_deg",
+    "lamp_profile",
     "bearing_offset_deg",
     "height_offset_m",
     "delay_s",

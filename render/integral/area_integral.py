@@ -247,6 +247,7 @@ class AreaIntegral:
             np.array(columns_hz) / columns_hz[0],
             self.sensor.vignetting,
             _fastest(self.sensor),
+            *_lamp_table(self.sensor),
         )
         poses_per_task = 1 if len(self.topology.gloss) else min(64, -(-n // workers)) or 1
         tasks = [slice(i, min(i + poses_per_task, n)) for i in range(0, n, poses_per_task)]
@@ -349,6 +350,15 @@ def _fastest(sensor: Sensor) -> float:
     if len(sensor.frequencies_hz) == 1 and not sensor.bends_rays and highest <= slow_hz:
         return 0.0
     return max(1 / camera.metres_per_radian for camera in sensor.by_frequency)
+
+
+def _lamp_table(sensor: Sensor) -> tuple[NDArray[np.float64], float]:
+    """Return the lamp's intensity over the tangent off the axis as far as the image sees, and the step of that."""
+    if not sensor.lamp_shapes_light:
+        return np.empty(0), 1.0
+    steps = 4096  # linear between them: some 1e-7 of the light
+    tangent = np.linspace(0.0, math.tan(math.radians(sensor.farthest_corner_deg)), steps + 1)
+    return sensor.lamp_intensity(1 / np.hypot(1.0, tangent)), float(tangent[1])
 
 
 _TOPOLOGIES: OrderedDict[bytes, MeshTopology] = OrderedDict()

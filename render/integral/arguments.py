@@ -127,6 +127,9 @@ class Light(NamedTuple):
     fastest : float
         4πf / c of the highest modulation frequency, for which the background's pixels are cut finely enough; 0 of a
         single frequency behind an ideal lens, whose pixels are not cut.
+    lamp : (m,) float64
+        Relative intensity of the lamp at even steps of the tangent off the axis; empty: even light.
+    lamp_step : float
     """
 
     albedo: float
@@ -134,6 +137,8 @@ class Light(NamedTuple):
     orders: NDArray[np.float64]
     vignetting: bool
     fastest: float
+    lamp: NDArray[np.float64]
+    lamp_step: float
 
 
 class Edges(NamedTuple):

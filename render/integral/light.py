@@ -72,7 +72,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
         else:
             t, reflected = 0.0, 0.0
         distance = t * length
-        a = weights[k] * _amplitude(distance, reflected, length, light.vignetting) if t != 0.0 else 0.0
+        a = weights[k] * _amplitude(distance, reflected, length, light) if t != 0.0 else 0.0
         intensity += a
         returns.amplitude[k - start], returns.phase[k - start] = a, light.radians_per_metre * distance
     sums.intensity[index], sums.coverage[index] = intensity, coverage
@@ -107,16 +107,26 @@ def _add_order(j, start, stop, samples, light, sums):  # type: ignore[no-untyped
 
 
 @kernel
-def _amplitude(distance, reflected, length, vignetting):  # type: ignore[no-untyped-def]
+def _amplitude(distance, reflected, length, light):  # type: ignore[no-untyped-def]
     """Return the amplitude of a hit; `length` is that of the ray (1, y, z), `reflected` ρ cos θ times that length."""
     a = reflected / (length * distance * distance)
-    return a / (length * length * length * length) if vignetting else a
+    if len(light.lamp) > 0:
+        a *= _lamp_intensity(light.lamp, light.lamp_step, length)
+    return a / (length * length * length * length) if light.vignetting else a
+
+
+@kernel
+def _lamp_intensity(lamp, step, length):  # type: ignore[no-untyped-def]
+    """Return the lamp's intensity along a ray (1, y, z), whose length is given, from its table over the tangent."""
+    at = min(math.sqrt(max(length * length - 1.0, 0.0)) / step, len(lamp) - 1.0)
+    k = min(int(at), len(lamp) - 2)
+    return lamp[k] + (at - k) * (lamp[k + 1] - lamp[k])
 
 
 @kernel
 def _add_phasor(index, distance, reflected, length, weight, light, sums):  # type: ignore[no-untyped-def]
     """Add the light of one hit to a pixel; see :func:`_amplitude`."""
-    a = weight * _amplitude(distance, reflected, length, light.vignetting)
+    a = weight * _amplitude(distance, reflected, length, light)
     sums.intensity[index] += a
     for j in range(len(light.orders)):
         phase = light.radians_per_metre * distance * light.orders[j]
@@ -126,7 +136,7 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
 @kernel
 def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
     """Return the light of one hit at the modulation frequency; see :func:`_amplitude`."""
-    a = _amplitude(distance, reflected, length, light.vignetting)
+    a = _amplitude(distance, reflected, length, light)
     phase = light.radians_per_metre * distance
     return complex(a * math.cos(phase), a * math.sin(phase))
 

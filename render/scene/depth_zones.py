@@ -197,6 +197,8 @@ def _plan(
     length = np.sqrt(1 + x**2 + y[:, None] ** 2)
     ahead = rotation[2, 0] * x + rotation[2, 1] * y[:, None] + rotation[2, 2]
     falloff = (ahead / length) ** 4 if sensor.vignetting else np.ones(())
+    if sensor.lamp_shapes_light:
+        falloff = falloff * sensor.lamp_intensity(ahead / length)
     return _Plan(x, y, length, falloff, None if sensor.histogram is None else pieces, shares, coarser)
 
 

@@ -10,13 +10,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.background import Background, parameters_of_views
+from phasemark.render.bounces.bounced_light import check_bounces, refined
+from phasemark.render.bounces.radiosity import Bounces
 from phasemark.render.direct.bin_counts import detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of, zones_tile
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.sample_counts import signal_and_shares
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
-from phasemark.render.integral.arguments import Poses
+from phasemark.render.integral.arguments import Poses, Sums
+from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.ray_plan import UNTRUSTED
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.rigid import product, rigid_transforms
@@ -43,6 +46,15 @@ class SceneRenderer:
         As for :class:`~phasemark.render.Renderer`.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
+    bounces : int or "all"
+        How often light may bounce on its way from the first surface that it meets to the last (PHYSICS section 12).
+    bounce_tolerance : float
+        Patches are refined until the image changes by less than this share of its brightest pixel, root mean square.
+
+    Raises
+    ------
+    UsageError
+        The sensor's lamp is not described, or the sensor counts histograms, which have no bounces.
 
     Examples
     --------
@@ -63,6 +75,8 @@ class SceneRenderer:
         *,
         harmonics: Sequence[int] | None = None,
         intersector: str = "auto",
+        bounces: Bounces = 0,
+        bounce_tolerance: float = 2e-3,
     ) -> None:
         if not isinstance(scene, Scene):
             raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
@@ -70,6 +84,10 @@ class SceneRenderer:
         self.sensor = sensor
         self._harmonics = tuple(sensor.harmonic_orders if harmonics is None else harmonics)
         self._assembly = Assembly(scene.bodies, intersector)
+        self._intersector = intersector
+        check_bounces(bounces, bounce_tolerance, sensor)
+        self.bounces = bounces
+        self.bounce_tolerance = bounce_tolerance
         self.untrusted_pixels = 0
         """How many pixels, of all rendered so far, had too many edges to be split exactly."""
 
@@ -123,26 +141,93 @@ class SceneRenderer:
         workers: int = 1,
     ) -> PhasorImages:
         """Render the phasors of frames with any camera; see :meth:`render`."""
+        return self._images(self._sums(camera2world, bodies2world, background, workers)[0])
+
+    def albedo_powers(
+        self,
+        name: str,
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None = None,
+        *,
+        workers: int = 1,
+    ) -> list[PhasorImages]:
+        """Render frames as polynomials in the albedo of one body, S = S₀ + ρ S₁ + ρ² S₂ and so on.
+
+        Parameters
+        ----------
+        name : str
+            The body; its own albedo does not matter.
+        camera2world, bodies2world, workers
+            As for :meth:`render`.
+
+        Returns
+        -------
+        list of PhasorImages
+            Images of S₀, S₁, …, whose coverage and shares are the frame's. Without bounces there are two.
+
+        Raises
+        ------
+        UsageError
+            No body has that name, or as for :meth:`render`.
+        """
+        free = np.arange(len(self.scene)) == self.scene.index(name)
+        return [self._images(sums) for sums in self._sums(camera2world, bodies2world, None, workers, free)]
+
+    def _images(self, sums: Sums) -> PhasorImages:
+        images = images_of_sums(sums, self.sensor, self._harmonics)
+        shares = np.minimum(sums.shares.reshape(*sums.state.shape, -1), 1.0)
+        return replace(images, shares=shares, bodies=self.scene.names)
+
+    def _sums(
+        self,
+        camera2world: ArrayLike,
+        bodies2world: ArrayLike | dict[str, ArrayLike] | None,
+        background: Background | None,
+        workers: int,
+        free: NDArray[np.bool_] | None = None,
+    ) -> list[Sums]:
+        """Return the sums of all pixels, or those of each power of the albedo of bodies that are free, (b,)."""
         n, b = self._counts(camera2world)
+        if self.bounces and background is not None:
+            raise UsageError(
+                "light does not bounce off a 'background': put its wall and floor into the scene as bodies"
+            )
         shape = n, self.sensor.rows, self.sensor.cols
         columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
-        sums = no_light(shape, len(columns_hz), b)
+        powers = [no_light(shape, len(columns_hz), b) for _ in range(1 if free is None else 2)]
+        bounced: list[tuple[NDArray[np.int64], NDArray[np.complex128]]] = []
 
         def integrate(assembly: Assembly, which: NDArray[np.int64], poses: Poses, threads: int) -> None:
-            integral = AreaIntegral(assembly.topology, assembly.intersector, self.sensor, harmonics=self._harmonics)
-            found = integral.sums(poses, n_parts=b, workers=threads)
             pixels = (which[:, None] * shape[1] * shape[2] + np.arange(shape[1] * shape[2])).ravel()
-            for own, new in zip(sums[:4], found[:4], strict=True):
-                own[pixels] = new
-            sums.state[which] = found.state
+            for sums, topology in zip(powers, _by_power(assembly.topology, free), strict=True):
+                integral = AreaIntegral(topology, assembly.intersector, self.sensor, harmonics=self._harmonics)
+                found = integral.sums(poses, n_parts=b, workers=threads)
+                for own, new in zip(sums[:4], found[:4], strict=True):
+                    own[pixels] = new
+                sums.state[which] = found.state
+            if self.bounces:
+                bounced.append((pixels, self._bounced(assembly, poses, [0.0, *columns_hz], free)))
 
         self._for_each_placing(integrate, camera2world, bodies2world, background, workers)
-        self.untrusted_pixels += int((sums.state == UNTRUSTED).sum())
-        return replace(
-            images_of_sums(sums, self.sensor, self._harmonics),
-            shares=np.minimum(sums.shares.reshape(*shape, b), 1.0),
-            bodies=self.scene.names,
+        self.untrusted_pixels += int((powers[0].state == UNTRUSTED).sum())
+        for pixels, light in bounced:
+            for k in range(light.shape[2]):
+                if k == len(powers):
+                    dark = powers[0].phasor * 0, powers[0].intensity * 0
+                    powers.append(powers[0]._replace(phasor=dark[0], intensity=dark[1]))
+                powers[k].intensity[pixels] += light[:, 0, k].real
+                powers[k].phasor[pixels] += light[:, 1:, k]
+        return powers
+
+    def _bounced(
+        self, assembly: Assembly, poses: Poses, frequencies_hz: Sequence[float], free: NDArray[np.bool_] | None
+    ) -> NDArray[np.complex128]:
+        """Return the light that has bounced, (pixels of all poses, frequencies, powers)."""
+        light = refined(
+            assembly.topology, assembly.intersector, self.sensor, poses, self.bounce_tolerance, self._intersector
         )
+        found = light.phasors(frequencies_hz, self.bounces, self.bounce_tolerance, free)
+        return found.reshape(-1, *found.shape[2:])
 
     def histograms(
         self,
@@ -254,3 +339,11 @@ class SceneRenderer:
                 raise UsageError(f"a body reaches {ahead[:, 0].max():.4g} m ahead, through the wall at {wall:g} m")
             if floor is not None and ahead[:, 2].min() < -floor - _TOUCH_M:
                 raise UsageError(f"a body reaches {-ahead[:, 2].min():.4g} m down, through the floor at {floor:g} m")
+
+
+def _by_power(topology: MeshTopology, free: NDArray[np.bool_] | None) -> list[MeshTopology]:
+    """Return the surface whose light is the frame's; of free bodies, that without theirs, and that of theirs alone."""
+    if free is None:
+        return [topology]
+    own = free[topology.part]
+    return [topology._replace(albedo=albedo) for albedo in (np.where(own, 0.0, topology.albedo), own.astype(float))]

@@ -69,6 +69,13 @@ class Sensor(SensorQuantities):
         Light-sensitive share of the pixel's pitch, a centred rectangle.
     vignetting : bool
         Whether brightness falls as cos⁴ of the angle off the axis.
+    lamp_half_angle_deg : float, optional
+        The lamp, which is at the lens, sheds no light farther from the optical axis than this; it covers the whole
+        image. Light that bounces needs it. None: unknown.
+    lamp_profile : float or tuple of (angle_deg, intensity)
+        Intensity of the lamp over the angle off the axis: n for cosⁿ, 0 for even light, or samples by rising angle,
+        relative to the intensity to which `signal_e` refers. Between samples it is linear, before the first and beyond
+        the last it is theirs.
     modulation_hz : float or tuple of float
         Modulation frequency f; the range wraps at c / 2f. Several of them, in whole hertz and in the order in which a
         frame has their phase images: the range wraps at c / (2 · gcd) (PHYSICS section 10). A list of one is that

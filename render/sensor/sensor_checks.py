@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 
@@ -41,6 +42,23 @@ def check_principal_point(sensor: SensorQuantities) -> None:
             raise ValueError(
                 f"'principal_point_px' must lie within one {of} width and height of the image's centre, got "
                 f"{sensor.principal_point_px}"
+            )
+
+
+def check_lamp(sensor: SensorQuantities) -> None:
+    """Refuse a lamp that leaves a corner of the image dark, samples that do not rise, and a second profile."""
+    if sensor.lamp_shapes_light and sensor.histogram is not None:
+        raise ValueError("'lamp_profile' must be left out beside 'histogram', which has 'light_width' for its light")
+    if isinstance(sensor.lamp_profile, tuple):
+        angles = [angle for angle, _ in sensor.lamp_profile]
+        if any(b <= a for a, b in pairwise(angles)):
+            raise ValueError(f"'lamp_profile' must have samples by rising angle, got the angles {in_words(angles)}")
+    if sensor.lamp_half_angle_deg is not None:
+        corner_deg = sensor.farthest_corner_deg
+        if sensor.lamp_half_angle_deg < corner_deg * (1 - _ROUNDING):
+            raise ValueError(
+                f"'lamp_half_angle_deg' must be at least {corner_deg:.4g}, the angle of the image's farthest corner off"
+                f" the axis, got {sensor.lamp_half_angle_deg:g}"
             )
 
 
@@ -231,6 +249,7 @@ def check_fields(sensor: SensorQuantities) -> None:
     check_read_out(sensor)
     check_threshold(sensor)
     check_tables(sensor)
+    check_lamp(sensor)
 
 
 def _check_table(name: str, table: tuple[tuple[float, ...], ...], rows: int, cols: int, what: str) -> None:

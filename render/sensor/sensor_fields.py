@@ -47,6 +47,9 @@ _Finite = Annotated[float, Field(ge=-_LARGEST, le=_LARGEST, allow_inf_nan=False)
 _Order = Annotated[int, Field(ge=2, le=199)]
 _Pixel = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]
 _Row = tuple[_Finite, ...]
+_LampHalfAngleDeg = Annotated[float, Field(gt=0, le=180)]
+_CosinePower = Annotated[float, Field(ge=0, le=1000)]
+_LampSample = tuple[Annotated[float, Field(ge=0, le=180)], _NonNegative]
 _PulseShape = tuple[_NonNegative, ...]
 
 _ONE, _SEVERAL = "one frequency", "several frequencies"
@@ -63,6 +66,12 @@ _Frequencies = Annotated[
     | Annotated[tuple[_Positive, ...], Field(min_length=1, max_length=_MOST_FREQUENCIES), Tag(_SEVERAL)],
     Discriminator(lambda value: _SEVERAL if isinstance(value, list | tuple) else _ONE),
     BeforeValidator(_without_list_of_one),
+]
+
+_POWER, _SAMPLES = "a power of the cosine", "samples"
+_LampProfile = Annotated[
+    Annotated[_CosinePower, Tag(_POWER)] | Annotated[tuple[_LampSample, ...], Field(min_length=2), Tag(_SAMPLES)],
+    Discriminator(lambda value: _SAMPLES if isinstance(value, list | tuple) else _POWER),
 ]
 
 TABLES: dict[str, type[FieldTable]] = {"lens": Lens, "histogram": Histogram}
@@ -87,6 +96,8 @@ class SensorFields(FieldTable):
     height_offset_m: _MountHeight = 0.0
     fill_factor: tuple[_Fraction, _Fraction] = (1.0, 1.0)
     vignetting: bool = False
+    lamp_half_angle_deg: _LampHalfAngleDeg | None = None
+    lamp_profile: _LampProfile = 0.0
     # modulation and timing
     modulation_hz: _Frequencies = 10e6
     frame_rate_hz: _Positive = 3.0
@@ -160,7 +171,7 @@ class SensorFields(FieldTable):
 
     @classmethod
     def _refusal(cls, first: ErrorDetails) -> UsageError:
-        location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL))
+        location = tuple(part for part in first["loc"] if part not in (_ONE, _SEVERAL, _POWER, _SAMPLES))
         return super()._refusal({**first, "loc": location})
 
     @model_serializer(mode="wrap")

@@ -40,6 +40,28 @@ class SensorQuantities(SensorFields):
         return self.lens is not None and not self.lens.is_ideal
 
     @property
+    def farthest_corner_deg(self) -> float:
+        """Largest angle of the image's corners off the optical axis."""
+        y, z = self.tangents(np.array([0.0, self.cols] * 2), np.array([0.0, 0.0, self.rows, self.rows]))
+        return math.degrees(math.atan(np.hypot(y, z).max()))
+
+    @property
+    def lamp_shapes_light(self) -> bool:
+        """Whether the lamp's intensity changes over the image."""
+        return self.lamp_profile != 0.0
+
+    def lamp_intensity(self, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the lamp's relative intensity in directions by the cosine of their angle off the optical axis.
+
+        Beyond the lamp's half angle, where nothing is said, too.
+        """
+        if isinstance(self.lamp_profile, tuple):
+            angle_deg, intensity = np.array(self.lamp_profile).T
+            off_axis_deg = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+            return np.asarray(np.interp(off_axis_deg, angle_deg, intensity))
+        return np.asarray(np.clip(cosine, 0.0, 1.0) ** self.lamp_profile)
+
+    @property
     def centre_px(self) -> tuple[float, float]:
         """Where the optical axis meets the image, (u0, v0) in pixels."""
         return self.principal_point_px or (self.cols / 2, self.rows / 2)

@@ -1,0 +1,55 @@
+"""Slopes of the light that arrives along a surface, from patches beside one another."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from phasemark.render.bounces.patches import Patches
+
+_NEAREST = 16
+"""Patches among which neighbours are looked for."""
+_ALIKE = 0.8
+"""Least cosine between the normals of neighbours."""
+_BESIDE = 0.3
+"""Largest height of a neighbour over the plane of a patch, as a share of its distance."""
+
+
+class Slopes(NamedTuple):
+    """Linear maps from values at the centres of patches to their slopes along the surface, (n, n) each, 1/m."""
+
+    x: sparse.csr_array
+    y: sparse.csr_array
+    z: sparse.csr_array
+
+
+def slopes_of(patches: Patches) -> Slopes:
+    """Return slopes fitted through neighbours that continue the surface, those nearer with more weight."""
+    n, count = len(patches), min(_NEAREST, len(patches))
+    _, near = cKDTree(patches.centre).query(patches.centre, k=count)
+    near = np.asarray(near).reshape(n, count)
+    unit = patches.normal / np.linalg.norm(patches.normal, axis=1, keepdims=True)
+    offset = patches.centre[near] - patches.centre[:, None]
+    height = np.einsum("nkj,nj->nk", offset, unit)
+    distance = np.linalg.norm(offset, axis=2)
+    beside = (patches.body[near] == patches.body[:, None]) & (np.einsum("nkj,nj->nk", unit[near], unit) > _ALIKE)
+    beside &= (np.abs(height) < _BESIDE * distance) & (distance > 0)
+    flat = offset - height[:, :, None] * unit[:, None]
+    weight = np.where(beside, 1 / (distance**2 + (0.5 * patches.size[:, None]) ** 2), 0.0)
+    normal_equations = np.einsum("nk,nki,nkj->nij", weight, flat, flat)
+    scale = np.trace(normal_equations, axis1=1, axis2=2)
+    scale = np.where(scale > 0, scale, 1.0)[:, None, None]
+    along_normal = unit[:, :, None] * unit[:, None]  # no slope out of the surface
+    slightly = 1e-4  # where all neighbours lie in a row, no slope across it
+    inverse = np.linalg.inv(normal_equations + scale * (along_normal + slightly * np.eye(3)))
+    shares = np.einsum("nij,nkj,nk->ink", inverse, flat, weight)
+    rows = np.repeat(np.arange(n), count)
+    maps = []
+    for share in shares:
+        own = sparse.coo_array((share.ravel(), (rows, near.ravel())), shape=(n, n))
+        middle = sparse.coo_array((share.sum(axis=1), (np.arange(n), np.arange(n))), shape=(n, n))
+        maps.append((own - middle).tocsr())
+    return Slopes(*maps)

@@ -1,0 +1,193 @@
+"""Transport: how much light each two patches exchange, and how far it goes."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from phasemark import UsageError
+from phasemark.render.bounces.form_factors import triangle_form_factor
+from phasemark.render.bounces.patches import POINTS, Patches
+from phasemark.render.kernel import kernel
+
+_CLOSE = 3.0
+"""Patches nearer to one another than this many of their sizes take the closed form of their facets."""
+_NEAR = 20.0
+"""Those nearer than this take four points each; those beyond, one."""
+_BYTES, _MOST_GIB = 60, 16
+"""Of a pair of patches that see each other, and of all."""
+_PAIRS = 1 << 21
+"""Pairs of patches that are looked at together."""
+
+
+class Transport(NamedTuple):
+    """Pairs of patches that see one another, each pair once; a hollow patch sees itself.
+
+    Parameters
+    ----------
+    one, other : (m,) int64
+        Patches.
+    form_factor : (m, 2) float64
+        Share of the light that the first, and that the second of a pair receives which the other can send:
+        the mean over the receiver of ∫ cos θ cos θ' / (π d²) V dA over the sender.
+    way : (m, 2) float64
+        Mean, m, and variance, m², of the distances between points of both.
+    n : int
+        Number of patches.
+    """
+
+    one: NDArray[np.int64]
+    other: NDArray[np.int64]
+    form_factor: NDArray[np.float64]
+    way: NDArray[np.float64]
+    n: int
+
+    def operator(self, wave_number: float) -> sparse.csr_array:
+        """Return the (n, n) matrix from the light that leaves patches to that which arrives at them.
+
+        Parameters
+        ----------
+        wave_number : float
+            κ = 2πf / c, rad/m; 0: of intensities, real.
+        """
+        rows, columns = np.concatenate([self.one, self.other]), np.concatenate([self.other, self.one])
+        values = self.form_factor
+        if wave_number:
+            mean, variance = self.way.T
+            values = values * np.exp(1j * wave_number * mean - 0.5 * wave_number**2 * variance)[:, None]
+        return sparse.csr_array((values.T.ravel(), (rows, columns)), shape=(self.n, self.n))
+
+
+def transport_between(patches: Patches) -> Transport:
+    """Return the transport between all patches that see one another.
+
+    Raises
+    ------
+    UsageError
+        It does not fit into memory.
+    """
+    n, found = len(patches), []
+    gib = _BYTES * n * n / 2**30
+    if gib > _MOST_GIB:
+        raise UsageError(
+            f"light that bounces between {n} patches takes up to {gib:.0f} GiB, and {_MOST_GIB} are allowed: raise"
+            " 'bounce_tolerance', render from fewer places at a time, or leave out bodies far from the camera's light"
+        )
+    rows = max(_PAIRS // n, 1)
+    one, other = np.empty((2, rows * n), np.int64)
+    factor, way = np.empty((2, rows * n, 2))
+    far = np.empty(rows * n, np.bool_)
+    geometry = (
+        patches.points, patches.normals, patches.weights, patches.centre, patches.normal, patches.area, patches.size,
+    )  # fmt: skip
+    polygons = patches.first, patches.members, patches.side, patches.facets.corners
+    for start in range(0, n, rows):
+        m = _form_factors(start, min(start + rows, n), geometry, polygons, one, other, factor, way, far)
+        visible = np.empty(m)
+        visible[far[:m]] = _seen_by_centres(patches, one[:m][far[:m]], other[:m][far[:m]])
+        visible[~far[:m]] = _seen_by_points(patches, one[:m][~far[:m]], other[:m][~far[:m]])
+        visible[one[:m] == other[:m]] = 1.0
+        kept = visible > 0
+        found.append((one[:m][kept], other[:m][kept], (factor[:m] * visible[:, None])[kept], way[:m][kept]))
+    i, j, factors, ways = (np.concatenate(column) for column in zip(*found, strict=True))
+    received = np.bincount(i, factors[:, 0], n) + np.bincount(j, factors[:, 1], n)
+    factors /= np.maximum(np.column_stack([received[i], received[j]]), 1.0)  # no patch receives more than all
+    return Transport(i, j, factors, ways, n)
+
+
+def _seen_by_centres(patches: Patches, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return whether a point in the middle of each patch sees that of another."""
+    lifted = patches.outlook + patches.lift_m * patches.normal
+    return patches.sees(lifted[i], lifted[j])
+
+
+def _seen_by_points(patches: Patches, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return which share of the light between them four pairs of points of patches see."""
+    points, normals = patches.points, patches.normals
+    lifted = points + patches.lift_m * normals
+    seen, total = np.zeros(len(i)), np.full(len(i), 1e-300)
+    for k in range(POINTS):
+        share = np.empty(len(i))
+        _fill_kernel(points[i, k], normals[i, k], points[j, k], normals[j, k], share)
+        seen += share * patches.sees(lifted[i, k], lifted[j, k])
+        total += share
+    return np.asarray(seen / total)
+
+
+@kernel
+def _fill_kernel(p, n, q, m, out):  # type: ignore[no-untyped-def]
+    for k in range(len(out)):
+        out[k] = _kernel(p[k], n[k], q[k], m[k])
+
+
+@kernel
+def _kernel(p, n, q, m):  # type: ignore[no-untyped-def]
+    """Return cos θ cos θ' / (π d²) between a point p with normal n and q with normal m."""
+    x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    receives, sends = x * n[0] + y * n[1] + z * n[2], -(x * m[0] + y * m[1] + z * m[2])
+    if receives <= 0.0 or sends <= 0.0:
+        return 0.0
+    square = x * x + y * y + z * z
+    return receives * sends / (math.pi * square * square)
+
+
+@kernel
+def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far):  # type: ignore[no-untyped-def]
+    """Write pairs of patches, the first from `start` to `stop`, as if nothing stood between; return how many."""
+    points, normals, weights, centre, normal, area, size = geometry
+    count = 0
+    for i in range(start, stop):
+        for j in range(i, len(area)):
+            x, y, z = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1], centre[j, 2] - centre[i, 2]
+            reach = max(size[i], size[j])
+            if x * normal[i, 0] + y * normal[i, 1] + z * normal[i, 2] < -reach:
+                continue
+            if x * normal[j, 0] + y * normal[j, 1] + z * normal[j, 2] > reach:
+                continue
+            distance = math.sqrt(x * x + y * y + z * z)
+            total, first, second = 0.0, 0.0, 0.0
+            if distance > _NEAR * reach:
+                total = _kernel(centre[i], normal[i], centre[j], normal[j])
+                first, second = total * distance, total * distance * distance
+            else:
+                for k in range(POINTS):
+                    for m in range(POINTS):
+                        pair = _kernel(points[i, k], normals[i, k], points[j, m], normals[j, m])
+                        pair *= weights[i, k] * weights[j, m]
+                        square = 0.0
+                        for axis in range(3):
+                            square += (points[i, k, axis] - points[j, m, axis]) ** 2
+                        total, first, second = total + pair, first + pair * math.sqrt(square), second + pair * square
+            if total == 0.0:
+                continue
+            one[count], other[count], far[count] = i, j, distance > _NEAR * reach
+            way[count, 0] = first / total
+            way[count, 1] = max(second / total - way[count, 0] * way[count, 0], 0.0)
+            if distance > _CLOSE * reach:
+                factor[count, 0], factor[count, 1] = area[j] * total, area[i] * total
+            else:
+                factor[count, 0] = _closely(i, j, geometry, polygons)
+                factor[count, 1] = 0.0 if i == j else _closely(j, i, geometry, polygons)
+            count += 1
+    return count
+
+
+@kernel
+def _closely(i, j, geometry, polygons):  # type: ignore[no-untyped-def]
+    """Return the mean form factor of patch j at the points of patch i, from the closed form of the facets of j.
+
+    At each point, form factors of all senders add up to what they are together: where surfaces touch, the large
+    errors of the mean over four points cancel between senders beside one another.
+    """
+    points, normals, weights, _, _, _, _ = geometry
+    first, members, side, corners = polygons
+    total = 0.0
+    for k in range(POINTS):
+        for m in range(first[j], first[j + 1]):
+            form_factor = triangle_form_factor(points[i, k], normals[i, k], corners[members[m]], side[j])
+            total += weights[i, k] * form_factor
+    return total
