@@ -36,7 +36,7 @@ def _pose(at: tuple[float, float, float], normal: tuple[float, float, float] = (
 
 
 def _exchanged(bodies: list[Body], size_m: float) -> tuple[Patches, Transport]:
-    topology = Assembly(bodies, "auto").topology
+    topology = Assembly(bodies, "auto", solids=False).topology
     sizes = lambda points, normals: np.full(len(points), size_m)  # noqa: E731
     patches = make_patches(topology, sizes, sizes)
     return patches, transport_between(patches)

@@ -41,6 +41,8 @@ class Assembly:
         In the order of the parts of the surface.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
+    solids : bool
+        Whether primitives are the solids they are; False: the meshes that stand for them.
     """
 
     topology: MeshTopology
@@ -48,9 +50,10 @@ class Assembly:
     intersector: Intersector
     """Of the topology's faces."""
 
-    def __init__(self, bodies: Sequence[Body], intersector: str) -> None:
-        self._kind = intersector
-        self._solids = _solids(bodies)
+    def __init__(self, bodies: Sequence[Body], intersector: str, *, solids: bool = True) -> None:
+        self._kind, self._bodies = intersector, bodies
+        self._facets: Assembly | None = None
+        self._solids = _solids(bodies) if solids else [None] * len(bodies)
         self._own = _analysed(bodies, self._solids)
         self._shells = [
             _shell(body, solid, mesh) for body, solid, mesh in zip(bodies, self._solids, self._own, strict=True)
@@ -70,6 +73,7 @@ class Assembly:
     def copy(self) -> Assembly:
         """Return one that can be placed otherwise; what stands still in both is shared."""
         other = copy.copy(self)
+        other._facets = None
         other._moving, other._curves = self._moving.copy(), dict(self._curves)
         other._poses, other._bounds = self._poses.copy(), self._bounds.copy()
         base = self._base
@@ -103,6 +107,19 @@ class Assembly:
             self._moving = self._moving | bodies
             self._still = None
             self.intersector = self._intersectors()
+
+    def in_facets(self) -> Assembly:
+        """Return the same bodies, where they stand, as meshes."""
+        if all(solid is None for solid in self._solids):
+            return self
+        if self._facets is None:
+            self._facets = Assembly(self._bodies, self._kind, solids=False)
+        self._facets.place(self._poses)
+        return self._facets
+
+    def corners(self) -> NDArray[np.float64]:
+        """Return the vertices of all bodies, where they stand, those of the meshes of solids too, (v, 3)."""
+        return np.concatenate([self._placed_shell(b)[0] for b in range(len(self._own))])
 
     def check_outside(self, lens_m: NDArray[np.float64], names: Sequence[str], frames: NDArray[np.int64]) -> None:
         """Refuse a lens inside a closed body.
@@ -438,7 +455,7 @@ def _turn_bodies(moved, poses, first, own, placed, bounds):  # type: ignore[no-u
 def _close_pairs(
     mesh: MeshTopology, moved: NDArray[np.bool_], bounds: NDArray[np.float64], first: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return pairs of bodies, (p, 2), lower first, that may pass through one another and at least one of which moved."""
+    """Return pairs of bodies, (p, 2), lower first, one of which moved and that may pass through one another."""
     room = 256
     while True:
         pairs = np.empty((room, 2), np.int64)

@@ -19,7 +19,7 @@ from phasemark.render.direct.sample_counts import signal_and_shares
 from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
 from phasemark.render.integral.arguments import Poses, Sums
-from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.mesh_topology import NO_GLOSS, MeshTopology
 from phasemark.render.integral.ray_plan import UNTRUSTED
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.rigid import product, rigid_transforms
@@ -223,9 +223,8 @@ class SceneRenderer:
         self, assembly: Assembly, poses: Poses, frequencies_hz: Sequence[float], free: NDArray[np.bool_] | None
     ) -> NDArray[np.complex128]:
         """Return the light that has bounced, (pixels of all poses, frequencies, powers)."""
-        light = refined(
-            assembly.topology, assembly.intersector, self.sensor, poses, self.bounce_tolerance, self._intersector
-        )
+        mesh = assembly.in_facets()
+        light = refined(mesh.topology, mesh.intersector, self.sensor, poses, self.bounce_tolerance, self._intersector)
         found = light.phasors(frequencies_hz, self.bounces, self.bounce_tolerance, free)
         return found.reshape(-1, *found.shape[2:])
 
@@ -332,7 +331,7 @@ class SceneRenderer:
     ) -> None:
         """Refuse bodies that reach through the background."""
         wall, floor = background.wall_m, background.floor_m
-        vertices = assembly.topology.vertices
+        vertices = assembly.corners()
         for turn, origin in zip(level2world, lens, strict=True):
             ahead = product(vertices - origin, turn)
             if wall is not None and ahead[:, 0].max() > wall + _TOUCH_M:
@@ -346,4 +345,5 @@ def _by_power(topology: MeshTopology, free: NDArray[np.bool_] | None) -> list[Me
     if free is None:
         return [topology]
     own = free[topology.part]
-    return [topology._replace(albedo=albedo) for albedo in (np.where(own, 0.0, topology.albedo), own.astype(float))]
+    without = topology._replace(albedo=np.where(own, 0.0, topology.albedo))
+    return [without, topology._replace(albedo=own.astype(float), gloss=NO_GLOSS)]
