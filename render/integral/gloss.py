@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from phasemark.render.integral.light import landmark_hit
 from phasemark.render.kernel import kernel
 
-_PER_BOX = 0.7
-"""By how much the lobe's width the normal may turn over a box of a pixel."""
-_MOST_BOXES = 48
+_PER_BOX, _PER_BOX_OF_LOBE = 0.7, 1.5
+"""By how many of the lobe's widths, 1 / √m, the normal may turn over a box: in general, and where several boxes see a
+whole lobe, whose integral converges faster."""
+_FEW_BOXES, _MOST_BOXES = 3, 48
 _DARK = 12.0
 """Exponent e⁻ˣ of the light beside a lobe that need not be resolved."""
 
@@ -56,23 +57,25 @@ def count_highlight_boxes(n, samples, mesh, poses, camera, least):  # type: igno
         if f < 0 or mesh.gloss[f, 1] == 0.0:
             continue
         y, z, m = samples.rays[k, 0], samples.rays[k, 1], mesh.gloss[f, 2]
-        here = _angle(mesh, f, lens, matrix, y, z)
+        here = _sine(mesh, f, lens, matrix, y, z)
         turn = 0.0
         for side in (-aside, aside):
-            across = _angle(mesh, f, lens, matrix, y + side * camera.slope_u, z) - here
-            down = _angle(mesh, f, lens, matrix, y, z + side * camera.slope_v) - here
+            across = _sine(mesh, f, lens, matrix, y + side * camera.slope_u, z) - here
+            down = _sine(mesh, f, lens, matrix, y, z + side * camera.slope_v) - here
             turn = max(turn, math.hypot(across, down) / aside)
-        nearest = max(here - turn, 0.0)
-        if nearest > 1.5 or -m * math.log(math.cos(nearest)) > _DARK:
+        nearest = here - turn
+        if nearest > 0.0 and -0.5 * m * math.log(1.0 - nearest * nearest) > _DARK:
             continue
-        boxes = int(min(math.ceil(turn * math.sqrt(m) / _PER_BOX), _MOST_BOXES))
+        widths = turn * math.sqrt(m)
+        few = min(math.ceil(widths / _PER_BOX), _FEW_BOXES)
+        boxes = int(max(few, min(math.ceil(widths / _PER_BOX_OF_LOBE), _MOST_BOXES)))
         pixel = samples.pixel[k]
         own = least[pixel // camera.cols, pixel % camera.cols]
         own[0], own[1] = max(own[0], boxes), max(own[1], boxes)
 
 
 @kernel
-def _angle(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
-    """Return the angle of incidence of the ray (1, y, z) on a face."""
+def _sine(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
+    """Return the sine of the angle of incidence of the ray (1, y, z) on a face."""
     _, facing = landmark_hit(mesh, face, lens, matrix, y, z)
-    return math.acos(min(facing / math.sqrt(1.0 + y * y + z * z), 1.0))
+    return math.sqrt(max(1.0 - facing * facing / (1.0 + y * y + z * z), 0.0))
