@@ -162,7 +162,7 @@ def test_albedo_is_luminance_one_number_or_that_of_names():
     assert [[body.albedo for body in one.scene] for one in of] == [[0.7152, 0.5], [0.3, 0.3], [0.1, 0.5]]
 
 
-def test_a_file_of_a_model_becomes_a_scene(tmp_path):
+def test_a_file_of_a_model_becomes_a_scene(tmp_path, monkeypatch):
     file = tmp_path / "hall.xml"
     file.write_text(
         '<mujoco><worldbody><geom type="plane" size="2 2 1" rgba=".5 .5 .5 1"/><body name="ball" pos="1 0 .3">'
@@ -176,6 +176,11 @@ def test_a_file_of_a_model_becomes_a_scene(tmp_path):
     file.write_text('<mujoco><worldbody><geom type="blob" size="1"/></worldbody></mujoco>')
     with pytest.raises(InputFileError, match=r"hall\.xml: MuJoCo cannot read it: XML Error: invalid keyword: 'blob'"):
         Scene.read(file)
+    older = tmp_path / "hall.mjb"
+    older.write_bytes(bytes(400))
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log there
+    with pytest.raises(InputFileError, match=r"hall\.mjb: MuJoCo cannot read .* must be of its version, \d"):
+        Scene.read(older)
 
 
 def test_solids_of_a_body_that_overlap_are_one_without_inner_edges():

@@ -141,10 +141,12 @@ def scene_of_mjcf(path: Path, albedo: float | None) -> Scene:
     UsageError
         As :func:`seen_model` does.
     """
+    compiled = path.suffix.lower() == ".mjb"
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        model = (mujoco.MjModel.from_binary_path if compiled else mujoco.MjModel.from_xml_path)(str(path))
     except ValueError as error:
-        raise InputFileError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}") from None
+        version = f"; a compiled model must be of its version, {mujoco.__version__}" if compiled else ""
+        raise InputFileError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}{version}") from None
     return seen_model(model, "rgba" if albedo is None else albedo, -1, (0, 1, 2), True).scene
 
 

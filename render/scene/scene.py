@@ -124,8 +124,8 @@ class Scene:
         ----------
         path : path
             In metres. Of a URDF the visual geometry of each link is a body, named as the link, with all joints at 0.
-            An MJCF file (.xml) needs the extra ``[mujoco]``; its geoms are seen as in MuJoCo's viewer, at the first
-            positions of its joints.
+            MJCF (.xml) and compiled models (.mjb) need the extra ``[mujoco]``; their geoms are seen as in MuJoCo's
+            viewer, at the first positions of the joints.
         albedo : float, optional
             As for :meth:`of_trimesh`.
 
@@ -143,7 +143,7 @@ class Scene:
             from phasemark.render.scene.urdf import links_of_urdf
 
             return cls(links_of_urdf(path, albedo))
-        if path.suffix.lower() in (".xml", ".mjcf"):
+        if path.suffix.lower() in (".xml", ".mjcf", ".mjb"):
             from phasemark.render.scene.mujoco_scene import scene_of_mjcf
 
             return scene_of_mjcf(path, albedo)
