@@ -1,7 +1,7 @@
 """Convex parts of solids: where rays enter them, and which edges they hide.
 
-A part is what lies behind all of its planes and inside its quadric. What it hides from the lens is convex too, so that
-an edge is hidden where both of its ends are.
+A part lies behind all of its planes and inside its quadric. The space that it hides from the lens is convex too, so
+that an edge is hidden where both of its ends are.
 """
 
 from __future__ import annotations

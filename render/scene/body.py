@@ -49,7 +49,7 @@ _CORNER = (math.pi / SEGMENTS) / math.sin(math.pi / SEGMENTS)
 
 
 class Primitive(NamedTuple):
-    """What a mesh stands for.
+    """The solid that a mesh stands for.
 
     Parameters
     ----------

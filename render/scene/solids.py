@@ -1,4 +1,4 @@
-"""Primitives as what they are: unions of convex parts, cut out of space by planes and quadrics, with their edges.
+"""Primitives as solids: unions of convex parts, cut out of space by planes and quadrics, with their edges.
 
 A ray asks each part's planes and quadrics; no triangles stand for a round surface. The outline of a round surface is
 found for each view, and drawn as finely as the image asks for.
@@ -28,7 +28,7 @@ class Solid(NamedTuple):
     quadrics : (q, 10) float64
         As :class:`~phasemark.render.integral.mesh_topology.MeshTopology` has them.
     first : (k + 1,) int64
-        Where the faces of each convex part begin: a part is what lies behind all of its planes and inside its quadric.
+        Where the faces of each convex part begin; it lies behind all of its planes and inside its quadric.
     balls : (k, 4) float64
         Centre and radius of a ball around each part.
     vertices : (v, 3) float64
