@@ -21,7 +21,7 @@ _FOLDERS = {
     "matcher/likelihood": "bank_images residuals strip_images",
     "matcher/nearest": "bank_minima cells search templates",
     "render": "background compile_cache kernel unwrapping",
-    "render/bounces": "form_factors transport",
+    "render/bounces": "form_factors patches transport",
     "render/direct": (
         "bin_counts expected_targets fit_model footprints photon_counts sample_counts scene_samples targets transients"
     ),

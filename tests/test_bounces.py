@@ -203,7 +203,7 @@ def test_extra_light_is_that_of_a_foreign_path_tracer(name: str) -> None:
         error = np.abs(images.phasors[0] - direct - known[f"{key}_minus_direct_S"])
         beyond = np.maximum(error - 4 * known[f"{key}_minus_direct_S_se"], 0) / brightest
         assert np.quantile(beyond, 0.9) < 1.5e-3
-        assert beyond.max() < (0.012 if name == "box" else 2.5e-3)  # floor at the corner of the box's foot
+        assert beyond.max() < (8e-3 if name == "box" else 2.5e-3)  # pixels at the foot of the box
 
 
 def _reference(name: str) -> tuple[Scene, Sensor, dict[str, Any]]:

@@ -32,6 +32,8 @@ _ENOUGH = 2
 _FINER = 2**-0.5
 _AT_FEET = 0.06
 """Size of facets where a body stands on a surface, as a share of the patches' size."""
+_FINE = 0.1
+"""Quantile of the patches' sizes that the points of pixels resolve."""
 _INWARD = 0.05
 """How far towards the middle of a facet the points lie that stand for its corners."""
 
@@ -194,7 +196,8 @@ class BouncedLight:
 
     def _seen(self, pose: Poses) -> _Seen:
         """Return the points that the pixels see in one pose."""
-        samples = self._mesh.samples_of_poses(pose, self._grid, 1.0, 1.0)
+        # pixels that see a surface at a slant are cut until their points resolve the patches
+        samples = self._mesh.samples_of_poses(pose, self._grid, float(np.quantile(self.patches.size, _FINE)), np.inf)
         y, z = samples.tangents.T
         rays = np.column_stack([np.ones(len(y)), y, z])
         patch, where = self.patches.seen(np.repeat(pose.lens, len(y), axis=0), rays @ pose.matrix[0])
