@@ -75,6 +75,7 @@ SOURCES = {
     "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py", "render/charts.py"),
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),
+    "multipath.png": ("docs/figures.py", "docs/multipath.md", "render/figures.py"),
     "scenes.png": ("docs/figures.py", "docs/scenes.md", "render/figures.py"),
     "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py", "render/charts.py"),
 }
@@ -184,11 +185,36 @@ def cost_figure(rows: list[dict[str, Any]]) -> Figure:
     return figure
 
 
+def names_of_page(page: str) -> dict[str, Any]:
+    """Run the first example of a page, and return its names."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
+    names: dict[str, Any] = {}
+    exec(text, names)
+    return names
+
+
+def multipath_figure() -> Figure:
+    """Draw range, and what light that bounces adds to it, of both scenes of the page on multipath."""
+    names = names_of_page("multipath.md")
+    sensor = names["sensor"].with_(rows=48, cols=48)
+    figure = Figure(figsize=(13.0, 3.2), layout="constrained")
+    axes = figure.subplots(1, 4)
+    for k, name in enumerate(("box", "corner")):
+        images = [SceneRenderer(names[name], sensor, bounces=n).phasors(np.eye(4)) for n in (0, "all")]
+        direct_m, all_m = (image.range_m[0] for image in images)
+        draw_range(axes[2 * k], direct_m, near_m=float(np.nanmin(direct_m)), far_m=float(np.nanmax(direct_m)))
+        axes[2 * k].set_title(f"{name}: range")
+        farther = axes[2 * k + 1].imshow(1e3 * (all_m - direct_m), cmap="viridis", vmin=0, vmax=(30, 100)[k])
+        figure.colorbar(farther, ax=axes[2 * k + 1], label="mm farther", extend="max")
+        axes[2 * k + 1].set_title("all bounces less direct light")
+        axes[2 * k + 1].set_xticks([])
+        axes[2 * k + 1].set_yticks([])
+    return figure
+
+
 def scene_figure() -> Figure:
     """Draw the scene of the page on scenes: finely, what fills most of each zone, and zones beside centre rays."""
-    page = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8").split("```python\n")[1].split("```")[0]
-    names: dict[str, Any] = {}
-    exec(page, names)
+    names = names_of_page("scenes.md")
     scene, images = names["scene"], names["images"]
     sensor, finer = images.sensor, 15
     fine = sensor.with_(rows=sensor.rows * finer, cols=sensor.cols * finer, histogram=None)
@@ -239,6 +265,7 @@ def main() -> None:
     runs = arguments.runs
     write(demo_figure(), "demo.png")
     write(scene_figure(), "scenes.png")
+    write(multipath_figure(), "multipath.png")
     write(drive_figure(run_drive(default_drive())), "drive.png")
     for command, figures in LEFT_BY.items():
         made = made_by(f"{command} --force", [OUT / source for source in figures.values()], runs, *PHASEMARK)
