@@ -73,7 +73,7 @@ def _dense(bodies: list[Body], sensor: Sensor) -> str:
     """Compare n × n rays a pixel of Embree with the exact frame: errors and times, one thread."""
     renderer, camera = SceneRenderer(Scene(bodies), sensor), _at((-0.3, 0.0, 0.5))
     exact = renderer.phasors(camera).phasor[0]
-    surface = renderer._assembly.topology
+    surface = renderer._assembly.in_facets().topology
     caster = make_intersector(surface.vertices, surface.faces)
     tangent, found = math.tan(math.radians(sensor.half_angle_h_deg)), []
     for n in _DENSE:

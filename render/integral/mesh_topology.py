@@ -161,7 +161,7 @@ class MeshTopology(NamedTuple):
         if not kept.any():
             raise UsageError("the mesh has no face with an area")
         kept = np.flatnonzero(kept)
-        kept = kept[_along_curve(vertices[faces[kept]].mean(axis=1))]
+        kept = kept[along_curve(vertices[faces[kept]].mean(axis=1))]
         faces, part, albedo, quadric, a = faces[kept], part[kept], albedo[kept], quadric[kept], a[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
@@ -261,7 +261,7 @@ class MeshTopology(NamedTuple):
         )
 
 
-def _along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
+def along_curve(points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Order points along a Z-curve through space: what is near in space is near in memory."""
     cell = np.ptp(points, axis=0).max() / 1023 or 1.0
     grid = ((points - points.min(axis=0)) / cell).astype(np.int64)

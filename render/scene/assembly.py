@@ -20,7 +20,7 @@ from phasemark.render.integral.convex_parts import enter_parts, part_around
 from phasemark.render.integral.face_search import FaceGrid
 from phasemark.render.integral.gloss import gloss_row
 from phasemark.render.integral.intersect import Intersector, make_intersector
-from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, in_lines
+from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, along_curve, in_lines
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body, Surface
@@ -322,7 +322,7 @@ class _NearestOf:
         return found
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _aimed_at(centre, radius_m, pose, origins, directions, rays, own_origins, own_directions):  # type: ignore[no-untyped-def]
     """Write the rays that meet a ball, in the frame of its body; return how many there are."""
     count = 0
@@ -348,7 +348,7 @@ def _aimed_at(centre, radius_m, pose, origins, directions, rays, own_origins, ow
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _keep_nearer(planes, numbers, faces, rays, origins, directions, found, distance):  # type: ignore[no-untyped-def]
     """Replace the faces that some rays met by those that are nearer along them."""
     for j in range(len(faces)):
@@ -465,7 +465,7 @@ def _close_pairs(
         room = n
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fill_close_pairs(mesh, moved, bounds, first, pairs):  # type: ignore[no-untyped-def]
     """Write the pairs; return how many there are, also beyond the room for them."""
     count = 0
@@ -489,7 +489,7 @@ def _fill_close_pairs(mesh, moved, bounds, first, pairs):  # type: ignore[no-unt
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _beyond(mesh, part, ball):  # type: ignore[no-untyped-def]
     """Return whether a ball is beyond a plane of a convex part, or apart from the ball around it."""
     own, square = mesh.balls[part], 0.0
@@ -504,14 +504,14 @@ def _beyond(mesh, part, ball):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _move(point, transposed, offset, out):  # type: ignore[no-untyped-def]
     _turn(point, transposed, out)
     for k in range(3):
         out[k] += offset[k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _turn_quadric(own, transposed, offset, out):  # type: ignore[no-untyped-def]
     """Turn and move p · A p + 2 b · p + c = 0: A' = R A Rᵀ, b' = R b − A' t, c' = c − (b' + R b) · t."""
     places = ((0, 3, 4), (3, 1, 5), (4, 5, 2))
@@ -532,14 +532,14 @@ def _turn_quadric(own, transposed, offset, out):  # type: ignore[no-untyped-def]
     out[9] = constant
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _turn(vector, transposed, out):  # type: ignore[no-untyped-def]
     x, y, z = float(vector[0]), float(vector[1]), float(vector[2])
     for k in range(3):
         out[k] = (x * transposed[0, k] + y * transposed[1, k]) + z * transposed[2, k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _turn_plane(plane, transposed, offset, sign, out):  # type: ignore[no-untyped-def]
     """Turn a plane n · p = d, or with sign −1 a function n · p + d."""
     x, y, z = float(plane[0]), float(plane[1]), float(plane[2])
@@ -599,7 +599,9 @@ def _shell(body: Body, solid: Solid | None, own: MeshTopology) -> _Shell:
     """Return the triangles in which crossings with other bodies are looked for."""
     if solid is None or body.primitive is None:
         return own.vertices, own.faces, np.arange(len(own.faces))
-    return body.primitive.vertices, np.asarray(body.mesh.faces, np.int32), body.primitive.face
+    vertices, faces = body.primitive.vertices, body.primitive.faces
+    order = along_curve(vertices[faces].mean(axis=1))
+    return vertices, faces[order].astype(np.int32), body.primitive.face[order]
 
 
 def _analysed(bodies: Sequence[Body], solids: Sequence[Solid | None]) -> list[MeshTopology]:

@@ -48,7 +48,7 @@ def crossings(
         room = n
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _block_bounds(vertices, faces):  # type: ignore[no-untyped-def]
     """Return lowest and highest coordinates of blocks of faces, (b, 2, 3)."""
     out = np.empty(((len(faces) + _BLOCK - 1) // _BLOCK, 2, 3))
@@ -62,7 +62,7 @@ def _block_bounds(vertices, faces):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _reaching(vertices, faces, block, bounds, found):  # type: ignore[no-untyped-def]
     """Write the faces of a block that reach into bounds (2, 3); return how many there are."""
     count = 0
@@ -77,7 +77,7 @@ def _reaching(vertices, faces, block, bounds, found):  # type: ignore[no-untyped
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs):  # type: ignore[no-untyped-def]
     """Write the segments along which triangles cross; return how many there are, also beyond the room for them."""
     count = 0
@@ -122,7 +122,7 @@ def _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs):  
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _overlap(inside, beyond, touch, at):  # type: ignore[no-untyped-def]
     """Return the shares of a segment between which another on the same line covers it; equal where it does not."""
     square = 0.0
@@ -138,7 +138,7 @@ def _overlap(inside, beyond, touch, at):  # type: ignore[no-untyped-def]
     return (begin, end) if (end - begin) * math.sqrt(square) > touch else (0.0, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _through(a, b, touch, ends, height):  # type: ignore[no-untyped-def]
     """Find where triangle `a` passes through the plane of `b`, into `ends` (2, 3); return whether it does."""
     ux, uy, uz = b[1, 0] - b[0, 0], b[1, 1] - b[0, 1], b[1, 2] - b[0, 2]
