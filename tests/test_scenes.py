@@ -257,6 +257,23 @@ def test_cylinders_and_ellipsoids_are_what_their_fine_meshes_are(axis):
         np.testing.assert_allclose(exact.phasor, facets.phasor, atol=2e-3 * np.abs(exact.phasor).max())
 
 
+def test_a_scene_is_the_same_wherever_the_world_begins():
+    fast = WIDE.with_(modulation_hz=60e6)
+
+    def phasor(shift: Any, sensor: Any) -> Any:
+        bodies = [
+            Body.box((4, 4, 0.1), pose=placed(shift + [1.5, 0, -0.4])),
+            Body.sphere(0.2, pose=placed(shift + [1.2, 0.1, 0.1])),
+            Body.box((0.1, 3, 3), pose=placed(shift + [2.5, 0, 0])),
+        ]
+        return np.asarray(SceneRenderer(Scene(bodies), sensor).phasors(placed(shift)).phasor[0])
+
+    here = phasor(np.zeros(3), fast)
+    np.testing.assert_allclose(phasor(np.array([7.0, -3.0, 1.0]), fast), here, atol=1e-7)
+    fine = phasor(np.zeros(3), fast.with_(rows=32, cols=32)).reshape(4, 8, 4, 8).mean(axis=(1, 3))
+    np.testing.assert_allclose(here, fine, atol=3e-4 * np.abs(fine).max())
+
+
 def test_both_intersectors_see_the_same_scene():
     scene = Scene(body_of(solid) for solid in random_solids(np.random.default_rng(8), 8))
     camera = placed((-0.4, 0.1, 0.5))

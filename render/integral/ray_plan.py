@@ -85,8 +85,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
             return SHORT_SEGMENTS, n
         if bin_segments(n_edges, camera, edges) < 0:
             return SHORT_LINKS, n
-        x, y, z = poses.lens[view, 0], poses.lens[view, 1], poses.lens[view, 2]
-        turn = fastest * camera.slope_u * math.sqrt(x * x + y * y + z * z)
+        turn = fastest * camera.slope_u * _distance(mesh, poses.lens[view])
         small = bent_lens and (
             bent_high_u - bent_low_u < _SMALL * camera.slope_u and bent_high_v - bent_low_v < _SMALL * camera.slope_v
         )
@@ -139,6 +138,18 @@ def plan_rays(  # type: ignore[no-untyped-def]
                     borders.along[b, 1] = edges.segments[e, 3] - edges.segments[e, 1]
                 n_borders = borders.placed[0]
     return len(poses.lens), n
+
+
+@kernel
+def _distance(mesh, lens):  # type: ignore[no-untyped-def]
+    """Return how far a landmark is, or the middle of a scene, and at least half of what that extends over."""
+    if not mesh.around:
+        return math.sqrt(lens[0] * lens[0] + lens[1] * lens[1] + lens[2] * lens[2])
+    away, extent = 0.0, 0.0
+    for k in range(3):
+        away += (lens[k] - 0.5 * (mesh.low[k] + mesh.high[k])) ** 2
+        extent += (mesh.high[k] - mesh.low[k]) ** 2
+    return math.sqrt(max(away, 0.25 * extent))
 
 
 @kernel
