@@ -262,9 +262,9 @@ def test_a_scene_is_the_same_wherever_the_world_begins():
 
     def phasor(shift: Any, sensor: Any) -> Any:
         bodies = [
-            Body.box((4, 4, 0.1), pose=placed(shift + [1.5, 0, -0.4])),
-            Body.sphere(0.2, pose=placed(shift + [1.2, 0.1, 0.1])),
-            Body.box((0.1, 3, 3), pose=placed(shift + [2.5, 0, 0])),
+            Body.box((4, 4, 0.1), pose=placed(np.add(shift, (1.5, 0, -0.4)))),
+            Body.sphere(0.2, pose=placed(np.add(shift, (1.2, 0.1, 0.1)))),
+            Body.box((0.1, 3, 3), pose=placed(np.add(shift, (2.5, 0, 0)))),
         ]
         return np.asarray(SceneRenderer(Scene(bodies), sensor).phasors(placed(shift)).phasor[0])
 
