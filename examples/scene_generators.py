@@ -180,11 +180,11 @@ def shadow() -> tuple[Any, Any, Scene]:
         raise UsageError("the Shadow hand needs the packages mujoco and gymnasium-robotics: pip install both")
     import mujoco
 
-    from phasemark.render.simulators.mujoco_scene import seen_model
+    from phasemark.render.scene.mujoco_scene import seen_model
 
     model = mujoco.MjModel.from_xml_path(str(Path(package.origin).parent / "envs" / "assets" / "hand" / "reach.xml"))
     seen = seen_model(model, 0.6, model.body("robot0:forearm").id, (1,), smooth=True)
-    return model, seen, Scene([body.named(f"hand {k}") for k, body in enumerate(seen.scene)])
+    return model, seen, Scene([body.named(f"hand {k}") for k, body in enumerate(seen.bodies)])
 
 
 def shadow_hand(index: int, rng: np.random.Generator) -> GeneratedScene:

@@ -159,7 +159,7 @@ def test_albedo_is_luminance_one_number_or_that_of_names():
     world = CAMERA + '<geom name="a" size=".1" pos="1 0 0" material="m"/>' + WALL
     model = in_mujoco(world, materials)[0].model
     of = [seen_model(model, albedo, -1, (0,), True) for albedo in ("rgba", 0.3, {"a": 0.1})]
-    assert [[body.albedo for body in one.scene] for one in of] == [[0.7152, 0.5], [0.3, 0.3], [0.1, 0.5]]
+    assert [[body.albedo for body in one.bodies] for one in of] == [[0.7152, 0.5], [0.3, 0.3], [0.1, 0.5]]
 
 
 def test_a_file_of_a_model_becomes_a_scene(tmp_path, monkeypatch):
@@ -186,7 +186,7 @@ def test_a_file_of_a_model_becomes_a_scene(tmp_path, monkeypatch):
 def test_solids_of_a_body_that_overlap_are_one_without_inner_edges():
     pair = '<geom size=".1" pos="0 -.05 0"/><geom size=".1" pos="0 .05 0"/><geom size=".1" pos="0 1 0"/>'
     sensor, data = in_mujoco(WALL + CAMERA + f'<body name="pair" pos="1 0 0"><freejoint/>{pair}</body>')
-    assert len(sensor.seen.scene) == 3  # wall, pair, and the ball apart from it
+    assert len(sensor.seen.bodies) == 3  # wall, pair, and the ball apart from it
     _, shares = ray_images(sensor.model, data, sensor.camera2world(data), sensor.sensor, np.ones(4), rays=4096)
     assert np.abs(sensor.read(data).truth.shares[..., 1] - shares[..., 1]).max() < 6e-3
 

@@ -17,7 +17,6 @@ from phasemark.render.integral.components import component_labels
 from phasemark.render.rigid import product
 from phasemark.render.scene import NEEDS_MUJOCO
 from phasemark.render.scene.body import Body
-from phasemark.render.scene.scene import Scene
 
 try:
     import mujoco
@@ -38,12 +37,12 @@ _ROUNDED = 2.0**20
 
 @dataclass(frozen=True)
 class SeenModel:
-    """Scene of a model, and where its bodies stand.
+    """Bodies of a model, and where they stand.
 
     Parameters
     ----------
-    scene : Scene
-        Each geom is a body; solids of one MuJoCo body and albedo that overlap are one together.
+    bodies : tuple of Body
+        Each geom is one; solids of one MuJoCo body and albedo that overlap are one together.
     owner : (b,) int64
         Numbers of the MuJoCo bodies.
     local : (b, 4, 4) float64
@@ -52,7 +51,7 @@ class SeenModel:
         Whether a plane is infinite along its x and y.
     """
 
-    scene: Scene
+    bodies: tuple[Body, ...]
     owner: NDArray[np.int64]
     local: NDArray[np.float64]
     endless: NDArray[np.bool_]
@@ -124,14 +123,14 @@ def seen_model(
         local.append(pose)
         first.append(g)
     endless = (model.geom_type[first] == _GEOM.mjGEOM_PLANE)[:, None] & (model.geom_size[first, :2] <= 0)
-    found = SeenModel(Scene(bodies), model.geom_bodyid[first].astype(np.int64), np.array(local), endless)
+    found = SeenModel(tuple(bodies), model.geom_bodyid[first].astype(np.int64), np.array(local), endless)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)  # what never moves stands where it is from the start
-    posed = [replace(body, pose=pose) for body, pose in zip(bodies, found.poses(data, np.zeros(3)), strict=True)]
-    return replace(found, scene=Scene(posed))
+    poses = found.poses(data, np.zeros(3))
+    return replace(found, bodies=tuple(replace(body, pose=pose) for body, pose in zip(bodies, poses, strict=True)))
 
 
-def scene_of_mjcf(path: Path, albedo: float | None) -> Scene:
+def bodies_of_mjcf(path: Path, albedo: float | None) -> tuple[Body, ...]:
     """Return the geoms that MuJoCo's viewer shows of a model in a file, at the first positions of its joints.
 
     Raises
@@ -147,7 +146,7 @@ def scene_of_mjcf(path: Path, albedo: float | None) -> Scene:
     except ValueError as error:
         version = f"; a compiled model must be of its version, {mujoco.__version__}" if compiled else ""
         raise InputFileError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}{version}") from None
-    return seen_model(model, "rgba" if albedo is None else albedo, -1, (0, 1, 2), True).scene
+    return seen_model(model, "rgba" if albedo is None else albedo, -1, (0, 1, 2), True).bodies
 
 
 def _together(

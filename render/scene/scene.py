@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.scene.body import Body
+from phasemark.render.scene.mesh_files import bodies_of_trimesh, loaded_meshes
 
 
 class Scene:
@@ -101,20 +102,7 @@ class Scene:
         UsageError
             The scene has no mesh.
         """
-        bodies = []
-        for node in scene.graph.nodes_geometry:
-            pose, geometry = scene.graph[node]
-            mesh = scene.geometry[geometry]
-            if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-                continue
-            rotation, scale = _without_scale(np.asarray(pose, np.float64))
-            faces = mesh.faces if np.linalg.det(scale) > 0 else mesh.faces[:, ::-1]
-            scaled = trimesh.Trimesh(np.asarray(mesh.vertices) @ scale.T, faces, process=False)
-            own = _albedo_of(mesh) if albedo is None else albedo
-            bodies.append(Body(scaled, own, str(node), rotation))
-        if not bodies:
-            raise UsageError("the scene holds no mesh")
-        return cls(bodies)
+        return cls(bodies_of_trimesh(scene, albedo))
 
     @classmethod
     def read(cls, path: str | Path, *, albedo: float | None = None) -> Scene:
@@ -144,10 +132,10 @@ class Scene:
 
             return cls(links_of_urdf(path, albedo))
         if path.suffix.lower() in (".xml", ".mjcf", ".mjb"):
-            from phasemark.render.scene.mujoco_scene import scene_of_mjcf
+            from phasemark.render.scene.mujoco_scene import bodies_of_mjcf
 
-            return scene_of_mjcf(path, albedo)
-        return cls.of_trimesh(loaded_meshes(path), albedo=albedo)
+            return cls(bodies_of_mjcf(path, albedo))
+        return cls(bodies_of_trimesh(loaded_meshes(path), albedo))
 
     def posed(self, bodies2world: ArrayLike | dict[str, ArrayLike] | None, n: int) -> NDArray[np.float64]:
         """Return where the bodies stand in each of n frames, (n, b, 4, 4).
@@ -185,41 +173,3 @@ class Scene:
                 rigid_transforms(array.reshape(-1, len(self), 4, 4)[:, b], f"pose of body '{name}'")
         poses[:] = array
         return poses
-
-
-def loaded_meshes(path: Path) -> trimesh.Scene:
-    """Return the meshes that trimesh reads of a file.
-
-    Raises
-    ------
-    InputFileError
-        It cannot be read, or holds no mesh.
-    """
-    try:
-        loaded = trimesh.load_scene(path)
-    except Exception as error:  # whatever one of a dozen readers raises
-        raise InputFileError(f"{path}: cannot be read as a scene ({type(error).__name__}: {error})") from None
-    if not any(isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) for mesh in loaded.geometry.values()):
-        raise InputFileError(f"{path}: holds no mesh with faces")
-    return loaded
-
-
-def _without_scale(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split a node's transform into a rigid one and what comes before it: scale and shear, (3, 3)."""
-    left, _, right = np.linalg.svd(pose[:3, :3])
-    rotation = left @ right
-    if np.linalg.det(rotation) < 0:
-        rotation = left @ np.diag([1.0, 1.0, -1.0]) @ right
-    rigid = np.eye(4)
-    rigid[:3, :3], rigid[:3, 3] = rotation, pose[:3, 3]
-    return rigid, rotation.T @ pose[:3, :3]
-
-
-def _albedo_of(mesh: trimesh.Trimesh) -> float | NDArray[np.float64]:
-    """Return the luminance of a mesh's material, or of each face's colour."""
-    visual: Any = mesh.visual
-    luminance = np.array([0.2126, 0.7152, 0.0722])
-    if visual.kind in ("face", "vertex"):
-        return np.asarray(np.asarray(visual.face_colors, np.float64)[:, :3] @ luminance / 255)
-    colour = getattr(getattr(visual, "material", None), "main_color", None)
-    return 0.8 if colour is None else float(np.asarray(colour, np.float64)[:3] @ luminance / 255)

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from phasemark import InputFileError
 from phasemark.render.scene.body import Body
-from phasemark.render.scene.scene import Scene, loaded_meshes
+from phasemark.render.scene.mesh_files import bodies_of_trimesh, loaded_meshes
 
 _ALBEDO = 0.8
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
@@ -112,7 +112,7 @@ def _shape(geometry: ElementTree.Element | None, albedo: float | None, path: Pat
             f"{where}: geometry <{shape.tag}> is unknown: there are box, sphere, cylinder, capsule and mesh"
         )
     file = _mesh_file(shape.get("filename", ""), path, where)
-    whole = Body.joined(Scene.of_trimesh(loaded_meshes(file), albedo=albedo))
+    whole = Body.joined(bodies_of_trimesh(loaded_meshes(file), albedo))
     scale, faces = _numbers(shape, "scale", 3, where, "1 1 1"), np.asarray(whole.mesh.faces)
     faces = faces if scale.prod() > 0 else faces[:, ::-1]
     return replace(whole, mesh=trimesh.Trimesh(np.asarray(whole.mesh.vertices) * scale, faces, process=False))

@@ -17,6 +17,7 @@ from phasemark.render.frames import Frames
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.scene import NEEDS_MUJOCO
 from phasemark.render.scene.mujoco_scene import body_name, seen_model
+from phasemark.render.scene.scene import Scene
 from phasemark.render.scene.scene_renderer import SceneRenderer
 from phasemark.render.sensor.range_noise import measured_range_std
 from phasemark.render.sensor.sensor import Sensor
@@ -169,7 +170,7 @@ class TofSensor:
         self._exclude = -1 if exclude_body is None else _number(model, "body", exclude_body)
         self._groups = np.isin(np.arange(_GROUPS), groups).astype(np.uint8)
         self.seen = seen_model(model, albedo, self._exclude, groups, smooth)
-        self.renderer = SceneRenderer(self.seen.scene, self.sensor)
+        self.renderer = SceneRenderer(Scene(self.seen.bodies), self.sensor)
         bodies = np.unique(self.seen.owner)
         self._of_body = (self.seen.owner[:, None] == bodies).astype(np.float64)
         self.bodies = tuple(body_name(model, int(b)) for b in bodies)
@@ -180,7 +181,7 @@ class TofSensor:
 
     def __repr__(self) -> str:
         """Describe in one line the sensor, the scene and the rate."""
-        return f"TofSensor({self.sensor!r}, {self.seen.scene!r}, {self._cadence.rate_hz:g} Hz)"
+        return f"TofSensor({self.sensor!r}, {self.renderer.scene!r}, {self._cadence.rate_hz:g} Hz)"
 
     def reset(self, seed: int | None = None) -> None:
         """Start again with the next reading, with other noise, or with that of a seed.
@@ -243,7 +244,7 @@ class TofSensor:
         poses = self.seen.poses(data, camera2world[:3, 3])
         wrong = ~np.isfinite(poses).all(axis=(1, 2))
         if wrong.any():
-            raise UsageError(f"the pose of body '{self.seen.scene.names[int(wrong.argmax())]}' is not finite")
+            raise UsageError(f"the pose of body '{self.renderer.scene.names[int(wrong.argmax())]}' is not finite")
         try:
             images = self.renderer.render(camera2world, poses)
         except UsageError as error:
