@@ -162,7 +162,7 @@ def test_what_does_not_go_together_is_refused_in_one_line() -> None:
     for poses, message in (
         (POSES, "must have a pose for each of 2 frames, got 3$"),
         (np.array([np.eye(4), 2 * np.eye(4)]), "must be a rotation and a translation, matrix 1 is not$"),
-        (np.full((2, 4, 4), np.nan), "must be finite$"),
+        (np.full((2, 4, 4), np.nan), "must be finite, matrix 0 is not$"),
         (np.ones((2, 3)), r"must have shape \(n, 4, 4\), got \(2, 3\)"),
     ):
         with pytest.raises(UsageError, match=f"^'camera2world' {message}"):

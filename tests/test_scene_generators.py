@@ -102,7 +102,7 @@ def test_bent_fingers_are_nearer_to_the_sensor(generators: ModuleType) -> None:
 def test_bent_fingers_of_the_shadow_hand_are_nearer_to_the_sensor(generators: ModuleType, tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("gymnasium_robotics")
-    of_name = {name: k for k, name in enumerate(generators.shadow()[1].scene.names)}
+    of_name = {body.name: k for k, body in enumerate(generators.shadow()[1].bodies)}
     seen = set()
     for index in range(20):
         made = generators.shadow_hand(index, stream(7, "scenes", index))
