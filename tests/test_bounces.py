@@ -38,7 +38,7 @@ def _pose(at: tuple[float, float, float], normal: tuple[float, float, float] = (
 def _exchanged(bodies: list[Body], size_m: float) -> tuple[Patches, Transport]:
     topology = Assembly(bodies, "auto", solids=False).topology
     sizes = lambda points, normals: np.full(len(points), size_m)  # noqa: E731
-    patches = make_patches(topology, sizes, sizes)
+    patches = make_patches(topology, sizes)
     return patches, transport_between(patches)
 
 

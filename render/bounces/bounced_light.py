@@ -30,8 +30,6 @@ _COARSEST, _LAST = 0.28, 0.06
 _ENOUGH = 2
 """Bounces by which the patches are refined."""
 _FINER = 2**-0.5
-_AT_FEET = 0.06
-"""Size of facets where a body stands on a surface, as a share of the patches' size."""
 _FINE = 0.1
 """Quantile of the patches' sizes that the points of pixels resolve."""
 _INWARD = 0.05
@@ -96,11 +94,10 @@ class BouncedLight:
         self._grid = camera_of(sensor, (0, sensor.rows), ())
         self._rays, self._light = lamp_rays(sensor)
         self._least_cosine = float(self._rays[:, 0].min())
-        feet = even_sizes(_AT_FEET * size, poses.lens)
-        self.patches = make_patches(topology, even_sizes(_PILOT, poses.lens), feet, intersector=kind)
+        self.patches = make_patches(topology, even_sizes(_PILOT, poses.lens), intersector=kind)
         self.transport = transport_between(self.patches)
         sizes = sizes_for_light(even_sizes(size, poses.lens), self.patches, self._brightness())
-        self.patches = make_patches(topology, sizes, feet, intersector=kind)
+        self.patches = make_patches(topology, sizes, intersector=kind)
         self.transport = transport_between(self.patches)
         self._slopes = slopes_of(self.patches)
 
@@ -175,7 +172,7 @@ class BouncedLight:
         out = np.empty((n, len(wave_numbers)), np.complex128)
         for k, wave_number in enumerate(wave_numbers):
             light = self._light[met] * np.exp(1j * wave_number * range_m)
-            out[:, k] = _summed(patch, light, n) / patches.area
+            out[:, k] = summed(patch, light, n) / patches.area
             out[whole, k] = (light_at * np.exp(1j * wave_number * distance)).sum(axis=1)[whole]
         return out
 
@@ -206,20 +203,14 @@ class BouncedLight:
             weight = weight / (1 + y * y + z * z) ** 2
         kept = patch >= 0
         offset = where[kept] - self.patches.centre[patch[kept]]
-        return _Seen(self._pixels(samples)[kept], patch[kept], offset, samples.range_m[kept], weight[kept])
-
-    def _pixels(self, samples: SceneSamples) -> NDArray[np.int64]:
-        """Return the pixels that samples lie in."""
-        u, v = self.sensor.image_points(*samples.tangents.T)
-        col = np.clip(u, 0, self.sensor.cols - 1).astype(np.int64)
-        return np.clip(v, 0, self.sensor.rows - 1).astype(np.int64) * self.sensor.cols + col
+        return _Seen(pixels_of(samples, self.sensor)[kept], patch[kept], offset, samples.range_m[kept], weight[kept])
 
     @property
     def brightest(self) -> float:
         """Intensity of the brightest pixel in direct light, first pose."""
         samples = self._mesh.samples_of_poses(of_poses(self.poses, slice(0, 1)), self._grid, 1.0, 1.0)
         light = samples.amplitude * (self._grid.scale_u * self._grid.scale_v)
-        return float(np.bincount(self._pixels(samples), light).max())
+        return float(np.bincount(pixels_of(samples, self.sensor), light).max())
 
     def _gathered(
         self, seen: list[_Seen], light: NDArray[np.complex128], wave_number: float, free: NDArray[np.bool_] | None
@@ -238,9 +229,9 @@ class BouncedLight:
             of_free = np.zeros(len(patch), np.bool_) if free is None else free[patch]
             fixed = np.where(of_free, 0.0, self.patches.albedo[patch])
             for power in range(powers):
-                out[view, :, power] += _summed(points.pixel, at[:, power] * fixed, pixels)
+                out[view, :, power] += summed(points.pixel, at[:, power] * fixed, pixels)
                 if free is not None:
-                    out[view, :, power + 1] += _summed(points.pixel, at[:, power] * of_free, pixels)
+                    out[view, :, power + 1] += summed(points.pixel, at[:, power] * of_free, pixels)
         return out
 
 
@@ -300,6 +291,13 @@ def check_bounces(bounces: Bounces, tolerance: float, sensor: Sensor) -> None:
         lamp_rays(sensor, 1)
 
 
-def _summed(number: NDArray[np.int64], value: NDArray[np.complex128], n: int) -> NDArray[np.complex128]:
+def pixels_of(samples: SceneSamples, sensor: Sensor) -> NDArray[np.int64]:
+    """Return the pixels that samples lie in."""
+    u, v = sensor.image_points(*samples.tangents.T)
+    col = np.clip(u, 0, sensor.cols - 1).astype(np.int64)
+    return np.clip(v, 0, sensor.rows - 1).astype(np.int64) * sensor.cols + col
+
+
+def summed(number: NDArray[np.int64], value: NDArray[np.complex128], n: int) -> NDArray[np.complex128]:
     """Return sums of values by number, (n,)."""
     return np.asarray(np.bincount(number, value.real, n) + 1j * np.bincount(number, value.imag, n))

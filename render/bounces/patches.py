@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from phasemark.render.bounces.feet import cut_where_bodies_stand
 from phasemark.render.integral.intersect import Intersector, make_intersector
 from phasemark.render.integral.mesh_topology import MeshTopology
 
@@ -18,6 +19,7 @@ _TURN = 0.35
 """Largest extent of the normals within a patch."""
 _THIN, _SHORTER = 0.25, 0.4
 """Triangles lower than this share of their length are cut shorter, for their centroids to say where they are."""
+_EVEN = 1 + 1e-9
 _DEEP = 0.2
 """Largest extent of a patch across its first facet, in sizes of the patch: surfaces in two planes are not joined."""
 _LIFT = 1e-5
@@ -132,7 +134,6 @@ class Patches:
 def make_patches(
     topology: MeshTopology,
     size_at: SizeAt,
-    finest_at: SizeAt,
     *,
     intersector: str = "auto",
 ) -> Patches:
@@ -148,27 +149,19 @@ def make_patches(
         The bodies, world frame.
     size_at : callable
         Largest extent of a patch.
-    finest_at : callable
-        Down to which length facets are cut where a closed body stands on them.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
     """
     lift = _LIFT * float((topology.high - topology.low).max())
     triangles, face, sizes = _cut(topology, size_at)
+    triangles, own = cut_where_bodies_stand(triangles, face, topology, lift)
+    face, sizes = face[own], sizes[own]
     solid = _Solid(topology, intersector, lift)
-    while True:
-        buried = solid.buries(triangles, face)
-        mixed = np.any(buried.any(axis=2) & ~buried.all(axis=2), axis=1)
-        again = mixed & (_longest(triangles) > finest_at(triangles.mean(axis=1), topology.planes[face, :3]))
-        if not again.any():
-            break
-        halves, own = _halved(triangles[again], np.flatnonzero(again))
-        own = np.concatenate([np.flatnonzero(~again), own])
-        triangles, face, sizes = np.concatenate([triangles[~again], halves]), face[own], sizes[own]
+    buried = solid.buries(triangles, face)
     edges = triangles[:, 1:] - triangles[:, :1]
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     facets = Facets(triangles, topology.planes[face, :3], areas, face)
-    useful = ~buried[:, :, 0] & _has_something_before(facets, topology, lift)
+    useful = ~buried & _has_something_before(facets, topology, lift)
     return _joined(facets, useful, topology, sizes, intersector, lift)
 
 
@@ -218,15 +211,12 @@ class _Solid:
         return np.asarray((met >= 0) & mesh.closed[met] & from_behind)
 
     def buries(self, triangles: NDArray[np.float64], face: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return whether points of triangles are inside a body, (f, 2 sides, 4): centre, then near the corners."""
-        centre = triangles.mean(axis=1, keepdims=True)
-        points = np.concatenate([centre, centre + 0.9 * (triangles - centre)], axis=1)
-        normals, closed = self._topology.planes[face, :3], self._topology.closed[face]
-        out = np.zeros((len(triangles), 2, 4), np.bool_)
+        """Return whether either side of triangles is inside a body, (f, 2)."""
+        centres, normals, closed = triangles.mean(axis=1), self._topology.planes[face, :3], self._topology.closed[face]
+        out = np.zeros((len(triangles), 2), np.bool_)
         for side in range(2):
             own = np.flatnonzero(~closed) if side else np.arange(len(face))
-            outward = np.repeat((1 - 2 * side) * normals[own], 4, axis=0)
-            out[own, side] = self.holds(points[own].reshape(-1, 3), outward).reshape(-1, 4)
+            out[own, side] = self.holds(centres[own], (1 - 2 * side) * normals[own])
         return out
 
 
@@ -337,18 +327,22 @@ def _points_of(
     leaf: NDArray[np.int64], facets: Facets
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return a point in each quarter of a patch, the quarters' shares of its area, and the normals there."""
-    pieces, own = facets.corners[leaf], leaf
-    while len(pieces) < 2 * POINTS:
-        pieces, own = _halved(pieces, own)
-    centres, areas = pieces.mean(axis=1), facets.areas[own] * len(leaf) / len(own)
+    pieces, own, areas = facets.corners[leaf], leaf, facets.areas[leaf]
+    while (large := areas > areas.sum() / (2 * POINTS) * _EVEN).any():
+        halves, parents = _halved(pieces[large], own[large])
+        pieces, own = np.concatenate([pieces[~large], halves]), np.concatenate([own[~large], parents])
+        areas = np.concatenate([areas[~large], np.tile(0.5 * areas[large], 2)])
+    centres = pieces.mean(axis=1)
     groups = [np.arange(len(own))]
     for _ in range(2):
-        halves: list[NDArray[np.int64]] = []
+        parts: list[NDArray[np.int64]] = []
         for group in groups:
             along = np.argmax(np.ptp(centres[group], axis=0))
             order = group[np.argsort(centres[group, along], kind="stable")]
-            halves += [order[: len(order) // 2], order[len(order) // 2 :]]
-        groups = halves
+            upto = np.cumsum(areas[order])
+            middle = int(np.clip(np.searchsorted(upto, 0.5 * upto[-1]), 1, len(order) - 1))
+            parts += [order[:middle], order[middle:]]
+        groups = parts
     points, normals, weights = np.empty((POINTS, 3)), np.empty((POINTS, 3)), np.empty(POINTS)
     for k, group in enumerate(groups):
         middle = areas[group] @ centres[group] / areas[group].sum()

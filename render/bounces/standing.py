@@ -1,0 +1,505 @@
+"""Light that bounces between a landmark and the wall and floor behind it, from any view, fast enough to be matched.
+
+Landmark and floor exchange light in the landmark's frame, where nothing moves: patches and transport are made once. The
+wall is far and its patches are few. Light at the patches changes slowly with the view, so that it is computed at nodes
+of a grid of distances and angles, when it is first asked for, and interpolated between them. Pixels are sampled exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from threading import Lock
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.spatial import cKDTree
+
+from phasemark.render.bounces.bounced_light import pixels_of, summed
+from phasemark.render.bounces.patches import Patches, SizeAt, make_patches
+from phasemark.render.bounces.sheets import Sheets
+from phasemark.render.bounces.slopes import Slopes, slopes_of
+from phasemark.render.bounces.transport import Transport, transport_between
+from phasemark.render.direct.scene_samples import WALL, SceneMesh, SceneSamples
+from phasemark.render.integral.area_integral import camera_of, of_poses, topology_of
+from phasemark.render.integral.arguments import Poses
+from phasemark.render.integral.intersect import make_intersector
+from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
+from phasemark.render.view import Views
+
+_LANDMARK, _FLOOR = 0, 1
+_PATCH = 0.4
+"""Size of patches as a share of the landmark's own, before surfaces come close."""
+_NEAR_LINES, _FINEST_SHARE = 0.5, 0.05
+"""Size of patches beside lines where surfaces meet, as a share of the distance from them; the least, of the landmark's."""
+_HOLLOW_RAD = 0.1
+"""Least angle between faces of a hollow edge."""
+_GROWTH = 0.25
+"""By how much patches of the floor grow with the distance from the landmark."""
+_WIDEST_M, _REACH_M = 1.0, 5.0
+"""Largest patch of the floor, and how far the floor reaches."""
+_GROUP = 1.4
+"""Size of groups of patches, between which light that has bounced twice is exchanged, in sizes of patches."""
+_SNAP_M = 2e-3
+"""Heights of the floor below the landmark that count as the same."""
+_STEP_SHARE, _STEP_RAD = 0.06, math.radians(6.0)
+"""Steps of the grid of nodes: of the logarithm of the distance, and of the angle δ."""
+_LAMP_STEP_RAD = math.radians(1.0)
+"""Directions of the lamp's axis that count as the same."""
+_SMALL = 1e-4
+"""Share of the first bounce below which later ones are left out."""
+_NEARBY_M = 1e-2
+_FINEST_M, _FARTHEST_M = 0.1, 20.0
+"""Pixels along which the range of wall or floor changes by more than the first are cut, up to the second."""
+
+
+class StandingView(NamedTuple):
+    """One view, in the landmark's frame.
+
+    Parameters
+    ----------
+    distance_m, delta_rad : float
+    lens : (3,) float64
+    matrix : (3, 3) float64
+        Landmark frame to the frame of the tilted camera.
+    wall_m, floor_m : float
+        From the lens to the wall, and down to the floor; 0: none.
+    wall_albedo, floor_albedo : float
+    """
+
+    distance_m: float
+    delta_rad: float
+    lens: NDArray[np.float64]
+    matrix: NDArray[np.float64]
+    wall_m: float
+    floor_m: float
+    wall_albedo: float
+    floor_albedo: float
+
+
+class _Stand:
+    """A landmark on, or above, a floor: patches, groups of patches, and the transport between them."""
+
+    def __init__(self, mesh: MeshTopology, floor_z_m: float | None, kind: str, wave_numbers: Sequence[float]) -> None:
+        topology = _with_floor(mesh, floor_z_m)
+        size_at = _sizes(mesh, floor_z_m)
+        self.patches = make_patches(topology, size_at, intersector=kind)
+        self.slopes: Slopes = slopes_of(self.patches)
+        transport: Transport = transport_between(self.patches)
+        self._gather_groups(size_at)
+        n, g = len(self.patches), len(self.area)
+        spread = sparse.csr_array((np.ones(n), (np.arange(n), self.group)), shape=(n, g))
+        share = self.patches.area / self.area[self.group]
+        mean = sparse.csr_array((share, (self.group, np.arange(n))), shape=(g, n))
+        self.fine, self.coarse = [], []
+        for wave_number in wave_numbers:
+            operator = transport.operator(wave_number)
+            self.fine.append(operator.astype(np.complex64))
+            self.coarse.append(np.asarray((mean @ operator @ spread).todense()))
+        self.mean = mean
+
+    def _gather_groups(self, size_at: SizeAt) -> None:
+        """Join patches of one body that face alike into groups, as `size_at` says how large patches are."""
+        patches = self.patches
+        level = np.floor(np.log2(size_at(patches.centre, patches.normal) * _GROUP)).astype(np.int64)
+        cell = np.floor(patches.centre / (2.0**level)[:, None]).astype(np.int64)
+        unit = patches.normal / np.linalg.norm(patches.normal, axis=1, keepdims=True)
+        facing = np.round(2 * unit).astype(np.int64)
+        keys = np.column_stack([patches.body, level, cell, facing, patches.side > 0])
+        _, self.group = np.unique(keys, axis=0, return_inverse=True)
+        self.group = self.group.ravel()
+        weights = patches.area
+        self.area = np.bincount(self.group, weights)
+        sums = lambda values: np.stack([np.bincount(self.group, weights * column) for column in values.T], axis=1)  # noqa: E731
+        self.centre = sums(patches.centre) / self.area[:, None]
+        self.normal = sums(patches.normal) / self.area[:, None]
+        first = np.full(len(self.area), -1)
+        far = np.linalg.norm(patches.centre - self.centre[self.group], axis=1)
+        order = np.argsort(-far)
+        first[self.group[order]] = order
+        self.outlook = patches.outlook[first] + patches.lift_m * patches.normal[first]
+
+
+class StandingLight:
+    """Light that bounces between a landmark and what stands behind it.
+
+    Parameters
+    ----------
+    mesh : MeshTopology
+        The landmark, landmark frame.
+    albedo : float
+        Of the landmark.
+    sensor : Sensor
+        The camera, with its lamp.
+    frequencies_hz : sequence of float
+        Of the phasors; 0: of intensities.
+    kind : {"auto", "embree", "float64"}
+        Intersector.
+    """
+
+    def __init__(
+        self, mesh: MeshTopology, albedo: float, sensor: Sensor, frequencies_hz: Sequence[float], kind: str = "auto"
+    ) -> None:
+        self._mesh, self._albedo, self._sensor, self._kind = mesh, albedo, sensor, kind
+        self._wave_numbers = [2 * math.pi * hz / SPEED_OF_LIGHT_M_S for hz in frequencies_hz]
+        self._stands: dict[int | None, _Stand] = {}
+        self._nodes: dict[tuple[object, ...], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
+        self._among: dict[tuple[float, float, float], NDArray[np.float64]] = {}
+        self._radius_m = float(np.hypot(*mesh.vertices[:, :2].T).max(initial=0.0))
+        self._lock = Lock()
+        self._sampler = SceneMesh.of_surface(mesh, make_intersector(mesh.vertices, mesh.faces, kind), WALL)
+        self._grid = camera_of(sensor, (0, sensor.rows), ())
+        self._least_cosine = math.cos(math.radians(sensor.lamp_half_angle_deg or 0.0))
+
+    def stand(self, view: StandingView) -> tuple[int | None, _Stand]:
+        """Return the landmark on the floor that stands below it in a view, and a key of its height."""
+        key, floor_z = None, None
+        if view.floor_m:
+            floor_z = view.lens[2] - view.floor_m
+            foot = float(self._mesh.low[2])
+            key = round((foot - floor_z) / _SNAP_M)
+            floor_z = foot - key * _SNAP_M
+        with self._lock:
+            if key not in self._stands:
+                self._stands[key] = _Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
+        return key, self._stands[key]
+
+    def arriving(
+        self, view: StandingView, bounces: float
+    ) -> tuple[_Stand, NDArray[np.complex64], Sheets | None, NDArray[np.complex64]]:
+        """Return the light that arrives at the patches in a view, interpolated between nodes.
+
+        Returns
+        -------
+        stand : _Stand
+        at_patches : (frequencies, n) complex64
+        sheets : Sheets, optional
+        at_sheets : (frequencies, w) complex64
+        """
+        key, stand = self.stand(view)
+        axis = self._lamp_axis(view)
+        place = math.log(view.distance_m) / _STEP_SHARE, view.delta_rad / _STEP_RAD
+        first = [math.floor(p) - 1 for p in place]
+        weights = [_cubic(p - f - 1) for p, f in zip(place, first, strict=True)]
+        around = round(2 * math.pi / _STEP_RAD)
+        found, at_sheets = None, None
+        for a, weight_a in enumerate(weights[0]):
+            distance_m = math.exp(_STEP_SHARE * (first[0] + a))
+            for b, weight_b in enumerate(weights[1]):
+                weight = weight_a * weight_b
+                if weight == 0:
+                    continue
+                turn = (first[1] + b) % around
+                name = (
+                    key, bounces, first[0] + a, turn, axis,
+                    view.wall_m, view.floor_m, round(view.lens[2] / _SNAP_M), view.wall_albedo, view.floor_albedo,
+                )  # fmt: skip
+                with self._lock:
+                    node = self._nodes.get(name)
+                if node is None:
+                    node = self._solved(stand, self._node_view(view, distance_m, turn * _STEP_RAD, axis), bounces)
+                    with self._lock:
+                        self._nodes[name] = node
+                found = weight * node[0] if found is None else found + weight * node[0]
+                at_sheets = weight * node[1] if at_sheets is None else at_sheets + weight * node[1]
+        assert found is not None
+        assert at_sheets is not None
+        scale = self._scale(view.distance_m)
+        return stand, found * scale, self._sheets(view), at_sheets * scale
+
+    def seen(self, poses: Poses, views: Views, bounces: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the light that has bounced, as the pixels receive it.
+
+        Parameters
+        ----------
+        poses : Poses
+            n poses of the landmark before the camera.
+        views : Views
+            The same, as the camera itself has them.
+        bounces : (n,) float64
+            How often light may bounce; inf: all.
+
+        Returns
+        -------
+        (n, pixels, frequencies) complex128
+        """
+        pixels = self._sensor.rows * self._sensor.cols
+        out = np.zeros((len(poses.lens), pixels, len(self._wave_numbers)), np.complex128)
+        for k in np.flatnonzero(bounces):
+            wall_m, floor_m, wall_albedo, floor_albedo = poses.background[k, :4]
+            view = StandingView(
+                float(views.distance_m[k]), float(views.delta_rad[k]), poses.lens[k], poses.matrix[k],
+                float(wall_m), float(floor_m), float(wall_albedo), float(floor_albedo),
+            )  # fmt: skip
+            stand, at_patches, sheets, at_sheets = self.arriving(view, float(bounces[k]))
+            samples = self._sampler.samples_of_poses(of_poses(poses, slice(k, k + 1)), self._grid, _FINEST_M, _FARTHEST_M)
+            self._gather(samples, view, stand, at_patches, sheets, at_sheets, out[k])
+        return out
+
+    def _gather(
+        self,
+        samples: SceneSamples,
+        view: StandingView,
+        stand: _Stand,
+        at_patches: NDArray[np.complex64],
+        sheets: Sheets | None,
+        at_sheets: NDArray[np.complex64],
+        out: NDArray[np.complex128],
+    ) -> None:
+        """Add what pixels receive, (pixels, frequencies), to `out`."""
+        y, z = samples.tangents.T
+        rays = np.column_stack([np.ones(len(y)), y, z]) @ view.matrix
+        weight = samples.area * (self._grid.scale_u * self._grid.scale_v)
+        if self._sensor.vignetting:
+            weight = weight / (1 + y * y + z * z) ** 2
+        pixel = pixels_of(samples, self._sensor)
+        length = np.sqrt(1 + y * y + z * z)
+        to = rays * (samples.range_m / length)[:, None]
+        ahead = np.array([math.cos(view.delta_rad), math.sin(view.delta_rad), 0.0])
+        across, before = to @ [-ahead[1], ahead[0], 0.0], view.wall_m - to @ ahead
+        on_wall = samples.part == WALL
+        on_strip = (samples.part == WALL + 1) & (sheets is not None and before < sheets.depth_m)
+        near = np.flatnonzero(~on_wall & ~on_strip)
+        patch, where = stand.patches.seen(np.repeat(view.lens[None], len(near), axis=0), rays[near])
+        near, where, patch = near[patch >= 0], where[patch >= 0], patch[patch >= 0]
+        offset = where - stand.patches.centre[patch]
+        returned = np.full(len(y), view.floor_albedo)
+        returned[on_wall] = view.wall_albedo
+        own = stand.patches.body[patch] == _LANDMARK
+        returned[near[own]] = self._albedo * stand.patches.albedo[patch[own]]
+        for order, wave_number in enumerate(self._wave_numbers):
+            arrives = np.zeros(len(y), np.complex128)
+            values = at_patches[order]
+            arrives[near] = values[patch]
+            for axis, slope in enumerate(stand.slopes):
+                arrives[near] += offset[:, axis] * (slope @ values)[patch]
+            if sheets is not None:
+                wall, strip = np.flatnonzero(on_wall), np.flatnonzero(on_strip)
+                arrives[wall] = sheets.interpolated(at_sheets[order], across[wall], to[wall, 2], strip=False)
+                if strip.size:
+                    arrives[strip] = sheets.interpolated(at_sheets[order], across[strip], before[strip], strip=True)
+            out[:, order] += summed(pixel, returned * weight * np.exp(1j * wave_number * samples.range_m) * arrives, len(out))
+
+    def _scale(self, distance_m: float) -> NDArray[np.complex64]:
+        """Return how light falls off and turns with the distance, which leaves nodes that change slowly."""
+        turn = np.exp(1j * np.array(self._wave_numbers) * distance_m)
+        return np.asarray(turn[:, None] / distance_m**2, np.complex64)
+
+    def _lamp_axis(self, view: StandingView) -> tuple[int, int]:
+        """Return azimuth and elevation of the lamp's axis, from the line to the landmark's axis, in whole steps."""
+        x, y, z = view.matrix[0]
+        azimuth = (math.atan2(y, x) - view.delta_rad + math.pi) % (2 * math.pi) - math.pi
+        return round(azimuth / _LAMP_STEP_RAD), round(math.asin(max(-1.0, min(1.0, z))) / _LAMP_STEP_RAD)
+
+    def _node_view(
+        self, view: StandingView, distance_m: float, delta_rad: float, axis: tuple[int, int]
+    ) -> StandingView:
+        azimuth, elevation = delta_rad + axis[0] * _LAMP_STEP_RAD, axis[1] * _LAMP_STEP_RAD
+        flat = math.cos(elevation)
+        ahead = np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
+        lens = np.array([-distance_m * math.cos(delta_rad), -distance_m * math.sin(delta_rad), view.lens[2]])
+        matrix = np.array([ahead, ahead, ahead])
+        wall_m = max(view.wall_m, distance_m + self._radius_m + _NEARBY_M) if view.wall_m else 0.0
+        return view._replace(distance_m=distance_m, delta_rad=delta_rad, lens=lens, matrix=matrix, wall_m=wall_m)
+
+    def _sheets(self, view: StandingView) -> Sheets | None:
+        """Return wall and strip of a view."""
+        if not view.wall_m:
+            return None
+        gap = view.wall_m - view.distance_m - self._radius_m
+        half = math.radians(self._sensor.lamp_half_angle_deg or 0.0)
+        return Sheets.behind(view.lens, view.delta_rad, view.wall_m, view.floor_m, gap, half)
+
+    def _lamp(
+        self, points: NDArray[np.float64], normals: NDArray[np.float64], view: StandingView, patches: Patches
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the light of the lamp at points (m, 3), cos θ / r², and their distance from it."""
+        to = points - view.lens
+        distance = np.linalg.norm(to, axis=1)
+        facing = -np.einsum("ij,ij->i", to, normals) / distance
+        cosine = to @ view.matrix[0] / distance
+        lit = np.flatnonzero((facing > 0) & (cosine >= self._least_cosine))
+        light = np.zeros(len(points))
+        seen = patches.sees(np.repeat(view.lens[None], len(lit), axis=0), points[lit])
+        lit = lit[seen]
+        light[lit] = self._sensor.lamp_intensity(cosine[lit]) * facing[lit] / distance[lit] ** 2
+        return light, distance
+
+    def _solved(
+        self, stand: _Stand, view: StandingView, bounces: float
+    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
+        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`.
+
+        The first bounce, and the last, go from patch to patch; those between them from group to group.
+        """
+        patches, sheets = stand.patches, self._sheets(view)
+        n, k = patches.weights.shape
+        whole = np.ones(n)
+        if sheets is not None:  # the floor of patches ends at the strip
+            ahead = np.array([math.cos(view.delta_rad), math.sin(view.delta_rad), 0.0])
+            beyond = (patches.centre - view.lens) @ ahead - (view.wall_m - sheets.depth_m)
+            whole = np.where(patches.body == _FLOOR, np.clip(0.5 - beyond / patches.size, 0.0, 1.0), 1.0)
+        returned = whole * np.where(patches.body == _LANDMARK, self._albedo * patches.albedo, view.floor_albedo)
+        by_group = stand.mean @ returned
+        lifted = patches.points + patches.lift_m * patches.normals
+        light, way = self._lamp(lifted.reshape(-1, 3), patches.normals.reshape(-1, 3), view, patches)
+        light *= patches.weights.ravel()
+        coupled = None if sheets is None else self._coupled(stand, sheets, view)
+        found, at_sheets = [], []
+        for order, wave_number in enumerate(self._wave_numbers):
+            lamp = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
+            fine = lambda values, order=order: stand.fine[order] @ (returned * values).astype(np.complex64)  # noqa: E731
+            once = fine(lamp)
+            groups, lamp_groups = stand.mean @ once, stand.mean @ lamp
+            if coupled is not None:
+                to_groups, from_groups, among, lamp_sheets = coupled.operators(wave_number, stand.area * by_group)
+                spread = to_groups @ lamp_sheets
+                groups = groups + spread
+                term_sheets = first_sheets = from_groups @ lamp_groups + among @ lamp_sheets
+            else:
+                spread = np.zeros(len(stand.area), np.complex128)
+                term_sheets = first_sheets = lamp_sheets = np.zeros(0, np.complex128)
+            # light after one bounce and more, but not the last
+            term, total, total_sheets = groups, np.zeros_like(groups), np.zeros_like(first_sheets)
+            sent, size = 0, np.abs(groups).max(initial=0.0)
+            while sent < bounces - 1 and np.abs(term).max(initial=0.0) > _SMALL * size:
+                total, total_sheets, sent = total + term, total_sheets + term_sheets, sent + 1
+                new = stand.coarse[order] @ (by_group * term)
+                if coupled is not None:
+                    new = new + to_groups @ term_sheets
+                    term_sheets = from_groups @ term + among @ term_sheets
+                term = new
+            if sent:
+                later = total - groups
+                arrives = fine(lamp + once + (spread + later)[stand.group])
+                if coupled is not None:
+                    arrives = arrives + (to_groups @ (lamp_sheets + total_sheets))[stand.group]
+                    first_sheets = from_groups @ (lamp_groups + total) + among @ (lamp_sheets + total_sheets)
+            else:
+                arrives = once + spread[stand.group]
+            found.append(arrives)
+            at_sheets.append(first_sheets)
+        scale = 1 / self._scale(view.distance_m)
+        return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
+
+    def _coupled(self, stand: _Stand, sheets: Sheets, view: StandingView) -> _Coupled:
+        """Return what sheets exchange with groups and with one another, and the lamp's light on them."""
+        lift = stand.patches.lift_m
+        to = sheets.centre - stand.outlook[:, None]
+        distance = np.linalg.norm(to, axis=2)
+        receives = np.maximum(np.einsum("gwj,gj->gw", to, stand.normal), 0.0)
+        sends = np.maximum(-np.einsum("gwj,wj->gw", to, sheets.normal), 0.0)
+        least = np.minimum(stand.area[:, None], sheets.area)  # of a disc that is near, half a hemisphere
+        exchange = receives * sends / (distance**2 * (math.pi * distance**2 + least))
+        group, sheet = np.nonzero(exchange)
+        seen = stand.patches.sees(stand.outlook[group], (sheets.centre + lift * sheets.normal)[sheet])
+        exchange[group[~seen], sheet[~seen]] = 0.0
+        points = sheets.points()
+        normals = np.repeat(sheets.normal, points.shape[1], axis=0)
+        light, way = self._lamp(points.reshape(-1, 3) + lift * normals, normals, view, stand.patches)
+        n = sheets.n_wall
+        albedo = np.where(np.arange(len(sheets.area)) < n, view.wall_albedo, view.floor_albedo)
+        key = view.wall_m, view.floor_m, sheets.depth_m
+        if key not in self._among:
+            self._among = {**self._among, key: sheets.between()}
+        apart = np.linalg.norm(sheets.centre[:, None] - sheets.centre, axis=2)
+        return _Coupled(
+            exchange, distance, self._among[key], apart, sheets.area, albedo,
+            light.reshape(points.shape[:2]), way.reshape(points.shape[:2]),
+        )  # fmt: skip
+
+
+class _Coupled(NamedTuple):
+    """Exchange of light with wall and strip.
+
+    Parameters
+    ----------
+    exchange, distance : (g, w) float64
+        Between groups and sheets: cos θ cos θ' / (π d²), and d.
+    among, apart : (w, w) float64
+        Form factors between sheets, and their distances.
+    area, albedo : (w,) float64
+        Of the sheets.
+    light, way : (w, 16) float64
+        Of the lamp, at points of the sheets, and their distance from it.
+    """
+
+    exchange: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    among: NDArray[np.float64]
+    apart: NDArray[np.float64]
+    area: NDArray[np.float64]
+    albedo: NDArray[np.float64]
+    light: NDArray[np.float64]
+    way: NDArray[np.float64]
+
+    def operators(self, wave_number: float, group_area: NDArray[np.float64]) -> tuple[NDArray[np.complex128], ...]:
+        """Return what carries arriving light from sheets to groups, back and among sheets, and the lamp's at them.
+
+        Parameters
+        ----------
+        wave_number : float
+        group_area : (g,) float64
+            Area of the groups times their albedo.
+        """
+        turned = self.exchange * np.exp(1j * wave_number * self.distance)
+        among = self.among * np.exp(1j * wave_number * self.apart) * self.albedo
+        lamp = (self.light * np.exp(1j * wave_number * self.way)).mean(axis=1)
+        return turned * (self.area * self.albedo), (turned * group_area[:, None]).T, among, lamp
+
+
+def _sizes(mesh: MeshTopology, floor_z_m: float | None) -> SizeAt:
+    """Return sizes of patches: small beside lines where two surfaces meet and see each other, larger away from them."""
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    surface, corners = cKDTree(mesh.vertices[mesh.faces].mean(axis=1)), _meeting_points(mesh, floor_z_m)
+    lines = cKDTree(corners) if len(corners) else None
+
+    def size_at(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+        away = np.maximum(surface.query(points)[0] - _PATCH * extent, 0.0)
+        size = np.minimum(_PATCH * extent + _GROWTH * away, _WIDEST_M)
+        if lines is not None:
+            size = np.minimum(size, np.maximum(_NEAR_LINES * lines.query(points)[0], _FINEST_SHARE * extent))
+        return np.asarray(size)
+
+    return size_at
+
+
+def _meeting_points(mesh: MeshTopology, floor_z_m: float | None) -> NDArray[np.float64]:
+    """Return points along the hollow edges of a landmark and along its foot on the floor, (m, 3)."""
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces)
+    hollow = ~whole.face_adjacency_convex & (whole.face_adjacency_angles > _HOLLOW_RAD)
+    segments = [whole.vertices[whole.face_adjacency_edges[hollow]]]
+    extent = float(np.ptp(mesh.vertices, axis=0).max())
+    if floor_z_m is not None and mesh.low[2] - floor_z_m < _NEARBY_M:
+        height = max(float(mesh.low[2]), floor_z_m) + 1e-4 * extent
+        segments.append(trimesh.intersections.mesh_plane(whole, [0, 0, 1], [0, 0, height]).reshape(-1, 2, 3))
+    ends = np.concatenate(segments)
+    count = np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / (_FINEST_SHARE * extent)).astype(np.int64) + 1
+    return np.concatenate([np.linspace(a, b, n) for (a, b), n in zip(ends, count, strict=True)] or [np.empty((0, 3))])
+
+
+def _with_floor(mesh: MeshTopology, floor_z_m: float | None) -> MeshTopology:
+    """Return a landmark with a floor below it, parts 0 and 1."""
+    vertices, faces = mesh.vertices, np.asarray(mesh.faces, np.int64)
+    part = np.full(len(faces), _LANDMARK, np.int32)
+    albedo = np.asarray(mesh.albedo)
+    if floor_z_m is not None:
+        r = _REACH_M
+        corners = np.array([[-r, -r, floor_z_m], [r, -r, floor_z_m], [r, r, floor_z_m], [-r, r, floor_z_m]])
+        sheet = np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)
+        vertices, faces = np.concatenate([vertices, corners]), np.concatenate([faces, sheet])
+        part, albedo = np.concatenate([part, [_FLOOR, _FLOOR]]), np.concatenate([albedo, [1.0, 1.0]])
+    attributes = {"part": part.astype(np.int32), "albedo": albedo}
+    found = topology_of(trimesh.Trimesh(vertices, faces, process=False, face_attributes=attributes))
+    return found._replace(closed=(found.part == _LANDMARK) & bool(mesh.closed.all()))
+
+
+def _cubic(share: float) -> NDArray[np.float64]:
+    """Return weights of four neighbours −1, 0, 1, 2 for a place between the middle two (Catmull and Rom)."""
+    t = share
+    return 0.5 * np.array([-t + 2 * t**2 - t**3, 2 - 5 * t**2 + 3 * t**3, t + 4 * t**2 - 3 * t**3, -(t**2) + t**3])
