@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,23 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render.kernel import kernel
 from phasemark.render.view import FARTHEST_M, Views
+
+BOUNCES = 4
+"""Column of the number of bounces among the parameters of a background."""
+Bounces = int | Literal["all"]
+"""How often light may bounce beyond the first surface."""
+
+
+def check_number_of_bounces(bounces: Bounces) -> None:
+    """Refuse a number of bounces that is none.
+
+    Raises
+    ------
+    UsageError
+    """
+    number = isinstance(bounces, int) and not isinstance(bounces, bool) and bounces >= 0
+    if not (number or bounces == "all"):
+        raise UsageError(f"'bounces' must be 0, 1, 2, … or 'all', got {bounces!r}")
 
 
 @dataclass(frozen=True)
@@ -28,6 +45,9 @@ class Background:
         How far the plane zc = −floor_m lies below the lens.
     wall_albedo, floor_albedo : float
         Albedo of the Lambertian surfaces, in [0, 1].
+    bounces : int or "all"
+        How often light may bounce between landmark, wall and floor on its way, beyond the first surface it meets
+        (PHYSICS section 12). The sensor must say how wide its lamp shines.
 
     Raises
     ------
@@ -39,6 +59,7 @@ class Background:
     floor_m: float | None = None
     wall_albedo: float = 0.5
     floor_albedo: float = 0.5
+    bounces: Bounces = 0
 
     def __post_init__(self) -> None:
         for name in ("wall_m", "floor_m"):
@@ -51,10 +72,12 @@ class Background:
             value = getattr(self, name)
             if not 0 <= value <= 1:
                 raise UsageError(f"'{name}' must be in [0, 1], got {value!r}")
+        check_number_of_bounces(self.bounces)
 
     def parameters(self) -> NDArray[np.float64]:
-        """Return (wall_m, floor_m, wall_albedo, floor_albedo), 0 for a plane that is not there."""
-        return np.array([self.wall_m or 0.0, self.floor_m or 0.0, self.wall_albedo, self.floor_albedo])
+        """Return (wall_m, floor_m, wall_albedo, floor_albedo, bounces); 0: a plane that is not there, inf: all bounces."""
+        bounces = math.inf if self.bounces == "all" else self.bounces
+        return np.array([self.wall_m or 0.0, self.floor_m or 0.0, self.wall_albedo, self.floor_albedo, bounces])
 
     def check_behind(self, vertices: NDArray[np.float64], views: Views) -> None:
         """Refuse a wall before, or a floor above, any point of the landmark.
@@ -112,7 +135,7 @@ def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
 
     Returns
     -------
-    (n, 4) float64
+    (n, 5) float64
 
     Raises
     ------
@@ -127,11 +150,11 @@ def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
         )
     if len(background) != n:
         raise UsageError(f"'background' must be one for all {n} views or one for each, got {len(background)}")
-    return np.array([(own or Background()).parameters() for own in background]).reshape(n, 4)
+    return np.array([(own or Background()).parameters() for own in background]).reshape(n, 5)
 
 
 def check_behind(parameters: NDArray[np.float64], vertices: NDArray[np.float64], views: Views) -> None:
-    """Refuse what :meth:`Background.check_behind` refuses; each view has its own row of `parameters`, (n, 4)."""
+    """Refuse what :meth:`Background.check_behind` refuses; each view has its own row of `parameters`, (n, 5)."""
     wall_m, floor_m = parameters[:, 0], parameters[:, 1]
     farthest, deepest = _extremes(wall_m, vertices, views)
     above = (floor_m > 0) & (deepest > floor_m + 1e-9)

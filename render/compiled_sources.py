@@ -23,14 +23,14 @@ _FOLDERS = {
     "render": "background compile_cache kernel unwrapping",
     "render/bounces": "form_factors patches transport",
     "render/direct": (
-        "bin_counts expected_targets fit_model footprints photon_counts sample_counts scene_samples targets transients"
+        "bin_counts expected_targets fit_model footprints photon_counts sample_counts targets transients"
     ),
     "render/exposure": "capture photoelectrons random_streams taps",
     "render/scene": "assembly crossings depth_slopes",
     "render/integral": (
         "arguments bent_edges borders circular components convex_parts edge_motion edge_projection edges_in_pixels"
         " face_search floor_phase gloss image_rays intersect intervals light limbs mesh_topology pixel_splitting"
-        " quadrature_rules ray_plan round_edges strips swept_light visible_faces"
+        " quadrature_rules ray_plan round_edges scene_samples strips swept_light visible_faces"
     ),
 }
 COMPILED_SOURCES = tuple(f"{folder}/{name}.py" for folder, names in _FOLDERS.items() for name in names.split())

@@ -15,17 +15,26 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.background import Background, Backgrounds, check_behind, parameters_of_views
+from phasemark.render.background import BOUNCES, Background, Backgrounds, check_behind, parameters_of_views
+from phasemark.render.bounces.bounced_light import check_can_bounce
+from phasemark.render.bounces.standing import StandingLight, Stands
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
-from phasemark.render.integral.area_integral import AreaIntegral, Slopes, Variant, images_of_sums, topology_of
-from phasemark.render.integral.arguments import Camera, Motion, Poses
+from phasemark.render.integral.area_integral import (
+    AreaIntegral,
+    Slopes,
+    Variant,
+    images_of_sums,
+    poses_of_views,
+    topology_of,
+)
+from phasemark.render.integral.arguments import Camera, Motion, Poses, Sums
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.ray_plan import UNTRUSTED
 from phasemark.render.integral.slopes import STEP
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
-from phasemark.render.rigid import product
+from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
@@ -105,6 +114,8 @@ class Renderer:
         self.sensor = sensor
         self.albedo = float(albedo)
         self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
+        self._stands: Stands = {}
+        self._standing: StandingLight | None = None
         self._integral = AreaIntegral(
             self.topology,
             make_intersector(self.topology.vertices, self.topology.faces, intersector),
@@ -402,7 +413,7 @@ class Renderer:
 
         Returns
         -------
-        (n, 4) float64
+        (n, 5) float64
             What stands behind the landmark in each view, rows as
             :meth:`~phasemark.render.background.Background.parameters`.
 
@@ -414,6 +425,10 @@ class Renderer:
         self._check_lens_outside(views)
         behind = parameters_of_views(background, len(views))
         check_behind(behind, self.topology.vertices, views)
+        if behind[:, BOUNCES].any():
+            check_can_bounce(self.sensor)
+            if not len(self.topology.faces):
+                raise UsageError("light that bounces needs a landmark: without one, put wall and floor into a Scene")
         return behind
 
     def _render(
@@ -437,11 +452,13 @@ class Renderer:
         if slope is not None:
             turns = np.array([name in _TURNING for name in parameters], np.bool_) & bool(background[:, :2].any())
             slopes = Slopes(slope, partial(_motion, ordered, parameters), turns)
-        poses = _poses(ordered, behind, self.sensor.cam2level)
+        poses = poses_of_views(ordered, behind, self.sensor.cam2level)
         sums = self._integral.sums(poses, n_parts=_PARTS, rows=rows, workers=workers, variant=variant, slopes=slopes)
         untrusted = int((sums.state == UNTRUSTED).sum())
         with _COUNTING:
             self.untrusted_pixels += untrusted
+        if behind[:, BOUNCES].any() and variant == "exact":
+            self._add_bounces(sums, poses, ordered, rows, workers, slope)
         images = images_of_sums(sums, self.sensor, self._integral.harmonics)
         upper = np.minimum(sums.shares[:, 1].reshape(sums.state.shape), 1.0)
         return replace(
@@ -454,6 +471,36 @@ class Renderer:
             harmonics={k: _restored(values, order) for k, values in images.harmonics.items()},
             by_hz={hz: _restored(values, order) for hz, values in images.by_hz.items()},
         )
+
+    def _add_bounces(
+        self,
+        sums: Sums,
+        poses: Poses,
+        views: Views,
+        rows: tuple[int, int],
+        workers: int,
+        slope: NDArray[np.complex128] | None,
+    ) -> None:
+        """Add light that has bounced to sums; slopes grow in proportion, as it changes with what the pixel sees."""
+        columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._integral.harmonics)
+        found = self._bouncing(columns_hz).seen(poses, views, workers)
+        light = found.reshape(len(views), self.sensor.rows, self.sensor.cols, -1)[:, rows[0] : rows[1]]
+        light = light.reshape(len(sums.intensity), -1)
+        if slope is not None:
+            for k, hz in enumerate(self.sensor.frequencies_hz):
+                column = columns_hz.index(hz)
+                direct = sums.phasor[:, column]
+                gain = np.divide(light[:, 1 + column], direct, out=np.zeros_like(direct), where=direct != 0)
+                slope[k] *= 1 + gain[:, None]
+        sums.phasor[:] += light[:, 1:]
+        sums.intensity[:] += light[:, 0].real
+
+    def _bouncing(self, columns_hz: Sequence[float]) -> StandingLight:
+        """Return what computes light that bounces; patches are shared with other albedos and cameras."""
+        if self._standing is None or not self._standing.is_of(self.albedo, self.sensor):
+            frequencies = [0.0, *columns_hz]
+            self._standing = StandingLight(self.topology, self.albedo, self.sensor, frequencies, stands=self._stands)
+        return self._standing
 
     def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
         """Return in which order to render views: a large mesh side after side, for the cache does not hold it all."""
@@ -512,18 +559,6 @@ _COUNTING = Lock()
 """Threads may share a renderer, and its count; the lock is no part of it, so that it can be copied and pickled."""
 
 
-def _poses(views: Views, background: NDArray[np.float64], level: NDArray[np.float64]) -> Poses:
-    rotation, translation = views.landmark2cam()
-    return Poses(
-        views.lens_in_landmark(),
-        product(level.T, rotation),
-        product(translation[:, None], level)[:, 0],
-        views.bearing_rad,
-        product(views.tilt2level(), level),
-        np.ascontiguousarray(background),
-    )
-
-
 def _motion(views: Views, parameters: Sequence[str], which: slice, poses: Poses, camera: Camera) -> Motion:
     """Return the poses of some of the views, and of each with one parameter after the other moved."""
     p, own = len(parameters), views[which]
@@ -531,4 +566,4 @@ def _motion(views: Views, parameters: Sequence[str], which: slice, poses: Poses,
     for k, name in enumerate(parameters):
         getattr(many, name)[k + 1 :: 1 + p] += STEP
     background = np.repeat(poses.background, 1 + p, axis=0)
-    return Motion(_poses(many, background, camera.level), np.full(p, STEP), np.empty((1 + p, 4)))
+    return Motion(poses_of_views(many, background, camera.level), np.full(p, STEP), np.empty((1 + p, 4)))

@@ -20,7 +20,7 @@ from phasemark.render.direct.fit_sensor import zone_orders
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.histogram_frames import capture_histograms
 from phasemark.render.direct.recordings import support_height, world2cam
-from phasemark.render.direct.scene_samples import SceneMesh, plane_samples
+from phasemark.render.integral.scene_samples import SceneMesh, plane_samples
 from phasemark.render.direct.transients import range_axis, zone_transients
 
 BASE = preset("tmf8820-3x3")

@@ -26,7 +26,7 @@ from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.sample_counts import signal_of_surfaces
-from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.integral.scene_samples import SceneMesh
 
 WALL, FAINT = Background(wall_m=1.6), Background(wall_m=1.73, wall_albedo=0.3)
 CROWDED = (

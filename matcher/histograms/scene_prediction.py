@@ -17,7 +17,7 @@ from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.recordings import object_centre, world2cam
 from phasemark.render.direct.sample_counts import signal_of_samples
-from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.sensor.sensor import Sensor
 

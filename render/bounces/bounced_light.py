@@ -9,17 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.render.background import Bounces, check_number_of_bounces
 from phasemark.render.bounces.lamp import lamp_rays
 from phasemark.render.bounces.patches import make_patches
-from phasemark.render.bounces.radiosity import Bounces, arriving
+from phasemark.render.bounces.radiosity import arriving
 from phasemark.render.bounces.refinement import even_sizes, sizes_for_light
 from phasemark.render.bounces.slopes import slopes_of
 from phasemark.render.bounces.transport import transport_between
-from phasemark.render.direct.scene_samples import SceneMesh, SceneSamples
 from phasemark.render.integral.area_integral import camera_of, of_poses
 from phasemark.render.integral.arguments import Poses
 from phasemark.render.integral.intersect import Intersector
 from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.scene_samples import SceneMesh, SceneSamples
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
 
@@ -280,15 +281,23 @@ def check_bounces(bounces: Bounces, tolerance: float, sensor: Sensor) -> None:
     ------
     UsageError
     """
-    number = isinstance(bounces, int) and not isinstance(bounces, bool) and bounces >= 0
-    if not (number or bounces == "all"):
-        raise UsageError(f"'bounces' must be 0, 1, 2, … or 'all', got {bounces!r}")
+    check_number_of_bounces(bounces)
     if not tolerance > 0:
         raise UsageError(f"'bounce_tolerance' must be positive, got {tolerance!r}")
-    if bounces and sensor.histogram is not None:
-        raise UsageError("histograms of light that bounces are not computed: 'bounces' must be 0 for this sensor")
     if bounces:
-        lamp_rays(sensor, 1)
+        check_can_bounce(sensor)
+
+
+def check_can_bounce(sensor: Sensor) -> None:
+    """Refuse a sensor for which light that bounces is not computed.
+
+    Raises
+    ------
+    UsageError
+    """
+    if sensor.histogram is not None:
+        raise UsageError("histograms of light that bounces are not computed: 'bounces' must be 0 for this sensor")
+    lamp_rays(sensor, 1)
 
 
 def pixels_of(samples: SceneSamples, sensor: Sensor) -> NDArray[np.int64]:

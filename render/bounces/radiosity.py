@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from phasemark import UsageError
-
-Bounces = int | Literal["all"]
-"""How many bounces beyond the first surface count."""
+from phasemark.render.background import Bounces
 
 _MOST = 1000
 """Bounces after which light that still goes on is given up."""

@@ -162,9 +162,7 @@ class Sheets(NamedTuple):
         return np.asarray((1 - s) * low + s * high)
 
 
-def _between(
-    grid: NDArray[np.float64], at: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _between(grid: NDArray[np.float64], at: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return which step of a rising grid places lie in, and how far along it; beyond the ends: the last step's line."""
     low = np.clip(np.searchsorted(grid, at) - 1, 0, len(grid) - 2)
     return low, (at - grid[low]) / (grid[low + 1] - grid[low])

@@ -1,8 +1,9 @@
 """Light that bounces between a landmark and the wall and floor behind it, from any view, fast enough to be matched.
 
-Landmark and floor exchange light in the landmark's frame, where nothing moves: patches and transport are made once. The
-wall is far and its patches are few. Light at the patches changes slowly with the view, so that it is computed at nodes
-of a grid of distances and angles, when it is first asked for, and interpolated between them. Pixels are sampled exactly.
+Landmark and floor exchange light in the landmark's frame, where nothing moves: patches and transport are made once.
+The wall is far and its patches are few. Light at the patches changes slowly with the view, so that it is computed at
+nodes of a grid of distances and angles, when it is first asked for, and interpolated between them. Pixels are sampled
+exactly.
 """
 
 from __future__ import annotations
@@ -18,25 +19,27 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.spatial import cKDTree
 
+from phasemark.render.background import BOUNCES
 from phasemark.render.bounces.bounced_light import pixels_of, summed
 from phasemark.render.bounces.patches import Patches, SizeAt, make_patches
 from phasemark.render.bounces.sheets import Sheets
 from phasemark.render.bounces.slopes import Slopes, slopes_of
 from phasemark.render.bounces.transport import Transport, transport_between
-from phasemark.render.direct.scene_samples import WALL, SceneMesh, SceneSamples
 from phasemark.render.integral.area_integral import camera_of, of_poses, topology_of
 from phasemark.render.integral.arguments import Poses
 from phasemark.render.integral.intersect import make_intersector
 from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.scene_samples import WALL, SceneMesh, SceneSamples
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
+from phasemark.render.threads import mapped
 from phasemark.render.view import Views
 
 _LANDMARK, _FLOOR = 0, 1
 _PATCH = 0.4
 """Size of patches as a share of the landmark's own, before surfaces come close."""
 _NEAR_LINES, _FINEST_SHARE = 0.5, 0.05
-"""Size of patches beside lines where surfaces meet, as a share of the distance from them; the least, of the landmark's."""
+"""Size of patches beside lines where surfaces meet, as a share of the distance from them; the least, of the extent."""
 _HOLLOW_RAD = 0.1
 """Least angle between faces of a hollow edge."""
 _GROWTH = 0.25
@@ -82,7 +85,7 @@ class StandingView(NamedTuple):
     floor_albedo: float
 
 
-class _Stand:
+class Stand:
     """A landmark on, or above, a floor: patches, groups of patches, and the transport between them."""
 
     def __init__(self, mesh: MeshTopology, floor_z_m: float | None, kind: str, wave_numbers: Sequence[float]) -> None:
@@ -125,6 +128,10 @@ class _Stand:
         self.outlook = patches.outlook[first] + patches.lift_m * patches.normal[first]
 
 
+Stands = dict[tuple[int | None, tuple[float, ...]], Stand]
+"""Landmarks on floors, by how far below the foot the floor is, and wave numbers."""
+
+
 class StandingLight:
     """Light that bounces between a landmark and what stands behind it.
 
@@ -140,14 +147,23 @@ class StandingLight:
         Of the phasors; 0: of intensities.
     kind : {"auto", "embree", "float64"}
         Intersector.
+    stands : Stands, optional
+        Where the patches of this landmark are kept, for other albedos and cameras to share.
     """
 
     def __init__(
-        self, mesh: MeshTopology, albedo: float, sensor: Sensor, frequencies_hz: Sequence[float], kind: str = "auto"
+        self,
+        mesh: MeshTopology,
+        albedo: float,
+        sensor: Sensor,
+        frequencies_hz: Sequence[float],
+        *,
+        kind: str = "auto",
+        stands: Stands | None = None,
     ) -> None:
         self._mesh, self._albedo, self._sensor, self._kind = mesh, albedo, sensor, kind
         self._wave_numbers = [2 * math.pi * hz / SPEED_OF_LIGHT_M_S for hz in frequencies_hz]
-        self._stands: dict[int | None, _Stand] = {}
+        self._stands = {} if stands is None else stands
         self._nodes: dict[tuple[object, ...], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
         self._among: dict[tuple[float, float, float], NDArray[np.float64]] = {}
         self._radius_m = float(np.hypot(*mesh.vertices[:, :2].T).max(initial=0.0))
@@ -156,7 +172,7 @@ class StandingLight:
         self._grid = camera_of(sensor, (0, sensor.rows), ())
         self._least_cosine = math.cos(math.radians(sensor.lamp_half_angle_deg or 0.0))
 
-    def stand(self, view: StandingView) -> tuple[int | None, _Stand]:
+    def stand(self, view: StandingView) -> tuple[int | None, Stand]:
         """Return the landmark on the floor that stands below it in a view, and a key of its height."""
         key, floor_z = None, None
         if view.floor_m:
@@ -165,18 +181,23 @@ class StandingLight:
             key = round((foot - floor_z) / _SNAP_M)
             floor_z = foot - key * _SNAP_M
         with self._lock:
-            if key not in self._stands:
-                self._stands[key] = _Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
-        return key, self._stands[key]
+            name = key, tuple(self._wave_numbers)
+            if name not in self._stands:
+                self._stands[name] = Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
+        return key, self._stands[name]
+
+    def is_of(self, albedo: float, sensor: Sensor) -> bool:
+        """Return True if it is that of an albedo and a camera."""
+        return self._albedo == albedo and self._sensor == sensor
 
     def arriving(
         self, view: StandingView, bounces: float
-    ) -> tuple[_Stand, NDArray[np.complex64], Sheets | None, NDArray[np.complex64]]:
+    ) -> tuple[Stand, NDArray[np.complex64], Sheets | None, NDArray[np.complex64]]:
         """Return the light that arrives at the patches in a view, interpolated between nodes.
 
         Returns
         -------
-        stand : _Stand
+        stand : Stand
         at_patches : (frequencies, n) complex64
         sheets : Sheets, optional
         at_sheets : (frequencies, w) complex64
@@ -212,17 +233,17 @@ class StandingLight:
         scale = self._scale(view.distance_m)
         return stand, found * scale, self._sheets(view), at_sheets * scale
 
-    def seen(self, poses: Poses, views: Views, bounces: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def seen(self, poses: Poses, views: Views, workers: int = 1) -> NDArray[np.complex128]:
         """Return the light that has bounced, as the pixels receive it.
 
         Parameters
         ----------
         poses : Poses
-            n poses of the landmark before the camera.
+            n poses of the landmark before the camera, with what stands behind it and how often light bounces.
         views : Views
             The same, as the camera itself has them.
-        bounces : (n,) float64
-            How often light may bounce; inf: all.
+        workers : int
+            Threads.
 
         Returns
         -------
@@ -230,22 +251,26 @@ class StandingLight:
         """
         pixels = self._sensor.rows * self._sensor.cols
         out = np.zeros((len(poses.lens), pixels, len(self._wave_numbers)), np.complex128)
-        for k in np.flatnonzero(bounces):
-            wall_m, floor_m, wall_albedo, floor_albedo = poses.background[k, :4]
+
+        def run(k: int) -> None:
+            wall_m, floor_m, wall_albedo, floor_albedo, bounces = poses.background[k]
             view = StandingView(
                 float(views.distance_m[k]), float(views.delta_rad[k]), poses.lens[k], poses.matrix[k],
                 float(wall_m), float(floor_m), float(wall_albedo), float(floor_albedo),
             )  # fmt: skip
-            stand, at_patches, sheets, at_sheets = self.arriving(view, float(bounces[k]))
-            samples = self._sampler.samples_of_poses(of_poses(poses, slice(k, k + 1)), self._grid, _FINEST_M, _FARTHEST_M)
+            stand, at_patches, sheets, at_sheets = self.arriving(view, float(bounces))
+            pose = of_poses(poses, slice(k, k + 1))
+            samples = self._sampler.samples_of_poses(pose, self._grid, _FINEST_M, _FARTHEST_M)
             self._gather(samples, view, stand, at_patches, sheets, at_sheets, out[k])
+
+        mapped(run, np.flatnonzero(poses.background[:, BOUNCES]).tolist(), workers)
         return out
 
     def _gather(
         self,
         samples: SceneSamples,
         view: StandingView,
-        stand: _Stand,
+        stand: Stand,
         at_patches: NDArray[np.complex64],
         sheets: Sheets | None,
         at_sheets: NDArray[np.complex64],
@@ -283,7 +308,8 @@ class StandingLight:
                 arrives[wall] = sheets.interpolated(at_sheets[order], across[wall], to[wall, 2], strip=False)
                 if strip.size:
                     arrives[strip] = sheets.interpolated(at_sheets[order], across[strip], before[strip], strip=True)
-            out[:, order] += summed(pixel, returned * weight * np.exp(1j * wave_number * samples.range_m) * arrives, len(out))
+            light = returned * weight * np.exp(1j * wave_number * samples.range_m) * arrives
+            out[:, order] += summed(pixel, light, len(out))
 
     def _scale(self, distance_m: float) -> NDArray[np.complex64]:
         """Return how light falls off and turns with the distance, which leaves nodes that change slowly."""
@@ -331,7 +357,7 @@ class StandingLight:
         return light, distance
 
     def _solved(
-        self, stand: _Stand, view: StandingView, bounces: float
+        self, stand: Stand, view: StandingView, bounces: float
     ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
         """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`.
 
@@ -387,7 +413,7 @@ class StandingLight:
         scale = 1 / self._scale(view.distance_m)
         return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
 
-    def _coupled(self, stand: _Stand, sheets: Sheets, view: StandingView) -> _Coupled:
+    def _coupled(self, stand: Stand, sheets: Sheets, view: StandingView) -> _Coupled:
         """Return what sheets exchange with groups and with one another, and the lamp's light on them."""
         lift = stand.patches.lift_m
         to = sheets.centre - stand.outlook[:, None]

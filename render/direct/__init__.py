@@ -24,9 +24,9 @@ if TYPE_CHECKING:
         support_height,
         world2cam,
     )
-    from phasemark.render.direct.scene_samples import SceneMesh, plane_samples
     from phasemark.render.direct.targets import Status, Targets, find_targets
     from phasemark.render.direct.transients import range_axis, zone_transients
+    from phasemark.render.integral.scene_samples import SceneMesh, plane_samples
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from phasemark.render.direct.bin_counts import piled_up
 from phasemark.render.direct.footprints import Footprints, footprint_grid, histogram_of
 from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, turn_about, world2cam
-from phasemark.render.direct.scene_samples import SceneSamples, plane_samples
 from phasemark.render.direct.transients import RangeAxis, zone_transients
+from phasemark.render.integral.scene_samples import SceneSamples, plane_samples
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 

@@ -34,8 +34,8 @@ from phasemark.render.direct.fit_model import (
 from phasemark.render.direct.fit_response import delays_of, fit_responses
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.recordings import ObjectRecording, PlaneRecording, world2cam
-from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.sensor.sensor import Sensor
 
 _STEP = 0.05

@@ -18,8 +18,8 @@ from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.direct.bin_counts import bin_response, counts_of_light, detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
-from phasemark.render.direct.scene_samples import WALL, SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.scene_samples import WALL, SceneMesh
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.direct.histogram_frames import HistogramFrames
-from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.rigid import rigid_transforms
 
 _LEVEL = 0.999  # least upward part of the normal of a level face

@@ -23,8 +23,8 @@ from phasemark.render.direct.footprints import (
     light_weight,
     zones_along,
 )
-from phasemark.render.direct.scene_samples import FLOOR, WALL, SceneSamples
 from phasemark.render.direct.transients import PARTS, through_lens
+from phasemark.render.integral.scene_samples import FLOOR, WALL, SceneSamples
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 

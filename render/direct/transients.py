@@ -18,7 +18,7 @@ from phasemark.render.direct.footprints import (
     footprints_of,
     histogram_of,
 )
-from phasemark.render.direct.scene_samples import SceneSamples
+from phasemark.render.integral.scene_samples import SceneSamples
 from phasemark.render.kernel import kernel
 from phasemark.render.sensor.sensor import Sensor
 

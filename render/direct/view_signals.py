@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from phasemark.render.background import Background
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
 from phasemark.render.direct.sample_counts import signal_of_samples, signal_of_surfaces
-from phasemark.render.direct.scene_samples import SceneMesh
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.threads import mapped

@@ -42,6 +42,7 @@ from phasemark.render.rigid import product
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.threads import mapped
+from phasemark.render.view import Views
 
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
@@ -452,6 +453,29 @@ def _of_views(sums: Sums, views: slice) -> Sums:
     )
 
 
+def poses_of_views(views: Views, background: NDArray[np.float64], level: NDArray[np.float64]) -> Poses:
+    """Return the poses of a landmark in n views.
+
+    Parameters
+    ----------
+    views : Views
+        As the camera itself has them, :meth:`~phasemark.render.Views.in_camera`.
+    background : (n, 5) float64
+        What stands behind the landmark, rows as :meth:`~phasemark.render.background.Background.parameters`.
+    level : (3, 3) float64
+        Camera frame to that of its mount.
+    """
+    rotation, translation = views.landmark2cam()
+    return Poses(
+        views.lens_in_landmark(),
+        product(level.T, rotation),
+        product(translation[:, None], level)[:, 0],
+        views.bearing_rad,
+        product(views.tilt2level(), level),
+        np.ascontiguousarray(background),
+    )
+
+
 def camera_poses(
     surface2cam: NDArray[np.float64], level: NDArray[np.float64], background: NDArray[np.float64]
 ) -> Poses:
@@ -463,7 +487,7 @@ def camera_poses(
         From the surface's frame to that of the camera's mount (x along the axis, y left, z up).
     level : (3, 3) float64
         Camera frame to that of its mount.
-    background : (n, 4) float64
+    background : (n, 5) float64
         What stands behind, in the mount's frame.
     """
     rotation, translation = surface2cam[:, :3, :3], surface2cam[:, :3, 3]

@@ -99,7 +99,7 @@ class Poses(NamedTuple):
     bearing : (n,) float64
     level : (n, 3, 3) float64
         Tilted to level camera frame: mount and view together.
-    background : (n, 4) float64
+    background : (n, 5) float64
         What stands behind the landmark, rows as :meth:`~phasemark.render.background.Background.parameters`.
     """
 

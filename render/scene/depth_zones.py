@@ -20,7 +20,7 @@ from phasemark.render.direct.bin_counts import detected_counts
 from phasemark.render.direct.footprints import footprints_of
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.sample_counts import signal_of_samples
-from phasemark.render.direct.scene_samples import SceneSamples
+from phasemark.render.integral.scene_samples import SceneSamples
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.scene.depth_pieces import Pieces, cut_pixels
 from phasemark.render.scene.depth_slopes import fill_amplitudes

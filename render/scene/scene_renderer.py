@@ -9,18 +9,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.render.background import Background, parameters_of_views
+from phasemark.render.background import Background, Bounces, parameters_of_views
 from phasemark.render.bounces.bounced_light import check_bounces, refined
-from phasemark.render.bounces.radiosity import Bounces
 from phasemark.render.direct.bin_counts import detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of, zones_tile
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.sample_counts import signal_and_shares
-from phasemark.render.direct.scene_samples import SceneMesh
 from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
 from phasemark.render.integral.arguments import Poses, Sums
 from phasemark.render.integral.mesh_topology import NO_GLOSS, MeshTopology
 from phasemark.render.integral.ray_plan import UNTRUSTED
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.rigid import product, rigid_transforms
 from phasemark.render.scene.assembly import Assembly

@@ -19,10 +19,10 @@ from phasemark.render.bench.histogram_law import (
 )
 from phasemark.render.direct.bin_counts import counts_of_light, detected_counts, expected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
-from phasemark.render.direct.scene_samples import plane_samples
 from phasemark.render.direct.targets import Status
 from phasemark.render.direct.transients import range_axis, zone_transients
 from phasemark.render.frames import Flag
+from phasemark.render.integral.scene_samples import plane_samples
 from phasemark.render.sensor.range_noise import direct_range_std
 from phasemark.render.sensor.sensor import Sensor
 

@@ -15,7 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
-from phasemark.render.integral.area_integral import NO_LEAST, Buffers, camera_poses, find_faces, of_poses, topology_of
+from phasemark.render.integral.area_integral import (
+    NO_LEAST,
+    Buffers,
+    camera_poses,
+    find_faces,
+    of_poses,
+    poses_of_views,
+    topology_of,
+)
 from phasemark.render.integral.arguments import Camera, Poses, towards_landmark, towards_level
 from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import ray_of
@@ -26,7 +34,6 @@ from phasemark.render.integral.quadrature_rules import G2W, G2X, G4W, G4X, gauss
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.kernel import kernel
-from phasemark.render.renderer import _poses
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.view import Views
 
@@ -153,7 +160,7 @@ class SceneMesh:
         SceneSamples
         """
         behind = parameters_of_views(background, len(views))
-        return self.samples_of_poses(_poses(views, behind, grid.level), grid, finest_m, farthest_m)
+        return self.samples_of_poses(poses_of_views(views, behind, grid.level), grid, finest_m, farthest_m)
 
     def samples_of_poses(self, poses: Poses, grid: Camera, finest_m: float, farthest_m: float) -> SceneSamples:
         """Sample what a grid of cells sees from poses; see :meth:`samples_of_views`."""
