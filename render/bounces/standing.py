@@ -46,16 +46,16 @@ _GROWTH = 0.25
 """By how much patches of the floor grow with the distance from the landmark."""
 _WIDEST_M, _REACH_M = 1.0, 5.0
 """Largest patch of the floor, and how far the floor reaches."""
-_GROUP = 1.4
-"""Size of groups of patches, between which light that has bounced twice is exchanged, in sizes of patches."""
+_GROUP = 2.0
+"""Size of groups of patches, which exchange light with the wall, in sizes of patches."""
 _SNAP_M = 2e-3
 """Heights of the floor below the landmark that count as the same."""
 _STEP_SHARE, _STEP_RAD = 0.06, math.radians(6.0)
 """Steps of the grid of nodes: of the logarithm of the distance, and of the angle δ."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
-_SMALL = 1e-4
-"""Share of the first bounce below which later ones are left out."""
+_SMALL = 3e-3
+"""Share of the first bounce below which later ones are taken as a geometric series."""
 _NEARBY_M = 1e-2
 _FINEST_M, _FARTHEST_M = 0.1, 20.0
 """Pixels along which the range of wall or floor changes by more than the first are cut, up to the second."""
@@ -96,15 +96,9 @@ class Stand:
         transport: Transport = transport_between(self.patches)
         self._gather_groups(size_at)
         n, g = len(self.patches), len(self.area)
-        spread = sparse.csr_array((np.ones(n), (np.arange(n), self.group)), shape=(n, g))
         share = self.patches.area / self.area[self.group]
-        mean = sparse.csr_array((share, (self.group, np.arange(n))), shape=(g, n))
-        self.fine, self.coarse = [], []
-        for wave_number in wave_numbers:
-            operator = transport.operator(wave_number)
-            self.fine.append(operator.astype(np.complex64))
-            self.coarse.append(np.asarray((mean @ operator @ spread).todense()))
-        self.mean = mean
+        self.mean = sparse.csr_array((share, (self.group, np.arange(n))), shape=(g, n))
+        self.operators = [transport.operator(number).astype(np.complex64) for number in wave_numbers]
 
     def _gather_groups(self, size_at: SizeAt) -> None:
         """Join patches of one body that face alike into groups, as `size_at` says how large patches are."""
@@ -359,10 +353,7 @@ class StandingLight:
     def _solved(
         self, stand: Stand, view: StandingView, bounces: float
     ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`.
-
-        The first bounce, and the last, go from patch to patch; those between them from group to group.
-        """
+        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`."""
         patches, sheets = stand.patches, self._sheets(view)
         n, k = patches.weights.shape
         whole = np.ones(n)
@@ -371,45 +362,33 @@ class StandingLight:
             beyond = (patches.centre - view.lens) @ ahead - (view.wall_m - sheets.depth_m)
             whole = np.where(patches.body == _FLOOR, np.clip(0.5 - beyond / patches.size, 0.0, 1.0), 1.0)
         returned = whole * np.where(patches.body == _LANDMARK, self._albedo * patches.albedo, view.floor_albedo)
-        by_group = stand.mean @ returned
         lifted = patches.points + patches.lift_m * patches.normals
         light, way = self._lamp(lifted.reshape(-1, 3), patches.normals.reshape(-1, 3), view, patches)
         light *= patches.weights.ravel()
         coupled = None if sheets is None else self._coupled(stand, sheets, view)
         found, at_sheets = [], []
-        for order, wave_number in enumerate(self._wave_numbers):
-            lamp = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
-            fine = lambda values, order=order: stand.fine[order] @ (returned * values).astype(np.complex64)  # noqa: E731
-            once = fine(lamp)
-            groups, lamp_groups = stand.mean @ once, stand.mean @ lamp
+        for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
+            term = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
             if coupled is not None:
-                to_groups, from_groups, among, lamp_sheets = coupled.operators(wave_number, stand.area * by_group)
-                spread = to_groups @ lamp_sheets
-                groups = groups + spread
-                term_sheets = first_sheets = from_groups @ lamp_groups + among @ lamp_sheets
+                to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
             else:
-                spread = np.zeros(len(stand.area), np.complex128)
-                term_sheets = first_sheets = lamp_sheets = np.zeros(0, np.complex128)
-            # light after one bounce and more, but not the last
-            term, total, total_sheets = groups, np.zeros_like(groups), np.zeros_like(first_sheets)
-            sent, size = 0, np.abs(groups).max(initial=0.0)
-            while sent < bounces - 1 and np.abs(term).max(initial=0.0) > _SMALL * size:
-                total, total_sheets, sent = total + term, total_sheets + term_sheets, sent + 1
-                new = stand.coarse[order] @ (by_group * term)
+                of_sheets = np.zeros(0, np.complex128)
+            total, total_sheets = np.zeros(n, np.complex128), np.zeros_like(of_sheets)
+            size, before, last, done = 0.0, 0.0, 0.0, 0
+            while done < bounces and np.abs(term).max(initial=0.0) > _SMALL * size:
+                sent = returned * term
+                term = operator @ sent.astype(np.complex64)
                 if coupled is not None:
-                    new = new + to_groups @ term_sheets
-                    term_sheets = from_groups @ term + among @ term_sheets
-                term = new
-            if sent:
-                later = total - groups
-                arrives = fine(lamp + once + (spread + later)[stand.group])
-                if coupled is not None:
-                    arrives = arrives + (to_groups @ (lamp_sheets + total_sheets))[stand.group]
-                    first_sheets = from_groups @ (lamp_groups + total) + among @ (lamp_sheets + total_sheets)
-            else:
-                arrives = once + spread[stand.group]
-            found.append(arrives)
-            at_sheets.append(first_sheets)
+                    term = term + (to_groups @ of_sheets)[stand.group]
+                    of_sheets = from_groups @ (stand.mean @ sent) + among @ of_sheets
+                total, total_sheets, done = total + term, total_sheets + of_sheets, done + 1
+                before, last = last, float(np.abs(term).max(initial=0.0))
+                size = last if done == 1 else size
+            if done < bounces and last < before:  # what is left falls off as a geometric series
+                rest = last / (before - last)
+                total, total_sheets = total + rest * term, total_sheets + rest * of_sheets
+            found.append(total)
+            at_sheets.append(total_sheets)
         scale = 1 / self._scale(view.distance_m)
         return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
 
@@ -465,13 +444,14 @@ class _Coupled(NamedTuple):
     way: NDArray[np.float64]
 
     def operators(self, wave_number: float, group_area: NDArray[np.float64]) -> tuple[NDArray[np.complex128], ...]:
-        """Return what carries arriving light from sheets to groups, back and among sheets, and the lamp's at them.
+        """Return what carries light from sheets to groups, from groups to sheets and among sheets, and the lamp's at them.
+
+        Light that arrives at sheets is carried on with their albedo; that of groups is what leaves them.
 
         Parameters
         ----------
         wave_number : float
         group_area : (g,) float64
-            Area of the groups times their albedo.
         """
         turned = self.exchange * np.exp(1j * wave_number * self.distance)
         among = self.among * np.exp(1j * wave_number * self.apart) * self.albedo
