@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -96,8 +97,9 @@ def renderer_of(bank: Bank, mesh: trimesh.Trimesh | None, albedo: float = 0.8) -
 
 
 def background_of(bank: Bank, *backgrounds: Background) -> PhasorImages:
-    """Return images of backgrounds alone, straight ahead, in the form of a bank's images."""
-    return renderer_of(bank, None).render(distance_m=np.ones(len(backgrounds)), background=backgrounds)
+    """Return images of backgrounds alone in direct light, straight ahead, in the form of a bank's images."""
+    direct = [replace(own, bounces=0) for own in backgrounds]
+    return renderer_of(bank, None).render(distance_m=np.ones(len(direct)), background=direct)
 
 
 def pixels_of(bank: Bank, pixels: str) -> NDArray[np.bool_]:
