@@ -48,6 +48,9 @@ class Background:
     bounces : int or "all"
         How often light may bounce between landmark, wall and floor on its way, beyond the first surface it meets
         (PHYSICS section 12). The sensor must say how wide its lamp shines.
+    floor_albedo_std : float
+        How well the floor's albedo is known: where light bounces, matching estimates it with this prior, and has what
+        is left in the covariance. Of 0.05 to 0.6: 0.33 ± 0.16.
 
     Raises
     ------
@@ -60,6 +63,7 @@ class Background:
     wall_albedo: float = 0.5
     floor_albedo: float = 0.5
     bounces: Bounces = 0
+    floor_albedo_std: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("wall_m", "floor_m"):
@@ -73,9 +77,16 @@ class Background:
             if not 0 <= value <= 1:
                 raise UsageError(f"'{name}' must be in [0, 1], got {value!r}")
         check_number_of_bounces(self.bounces)
+        if not (math.isfinite(self.floor_albedo_std) and self.floor_albedo_std >= 0):
+            raise UsageError(f"'floor_albedo_std' must be 0 or more, got {self.floor_albedo_std!r}")
+
+    @property
+    def estimates_floor_albedo(self) -> bool:
+        """Whether matching estimates the floor's albedo."""
+        return bool(self.bounces and self.floor_m and self.floor_albedo_std)
 
     def parameters(self) -> NDArray[np.float64]:
-        """Return (wall_m, floor_m, wall_albedo, floor_albedo, bounces); 0: a plane that is not there, inf: all bounces."""
+        """Return (wall_m, floor_m, wall_albedo, floor_albedo, bounces); 0: a plane that is not there, inf: all."""
         bounces = math.inf if self.bounces == "all" else self.bounces
         return np.array([self.wall_m or 0.0, self.floor_m or 0.0, self.wall_albedo, self.floor_albedo, bounces])
 

@@ -20,8 +20,8 @@ from phasemark.render.direct.fit_sensor import zone_orders
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.histogram_frames import capture_histograms
 from phasemark.render.direct.recordings import support_height, world2cam
-from phasemark.render.integral.scene_samples import SceneMesh, plane_samples
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.scene_samples import SceneMesh, plane_samples
 
 BASE = preset("tmf8820-3x3")
 SCALES = ((0.99, 1.015, 1.0), (0.99, 1.0, 1.0), (1.015, 1.0, 1.01))  # by converter, as the preset pairs zones

@@ -11,8 +11,8 @@ from phasemark import UsageError
 from phasemark.render import Sensor
 from phasemark.render.direct.bin_counts import expected_counts, piled_up, response_share, without_pile_up
 from phasemark.render.direct.footprints import footprint_grid
-from phasemark.render.integral.scene_samples import SceneMesh, SceneSamples, plane_samples
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.scene_samples import SceneMesh, SceneSamples, plane_samples
 from phasemark.render.sensor import Histogram
 
 IRF_STD_M = 0.02

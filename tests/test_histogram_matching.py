@@ -41,8 +41,8 @@ from phasemark.render.direct.expected_targets import expected_targets
 from phasemark.render.direct.footprints import footprint_grid
 from phasemark.render.direct.recordings import world2cam
 from phasemark.render.direct.sample_counts import signal_of_samples
-from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.direct.transients import range_axis, zone_transients
+from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.view import VIEW_FIELDS
 
 

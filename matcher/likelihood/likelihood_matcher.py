@@ -16,13 +16,14 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.shards.executor import processors
 from phasemark.matcher.chi_squared import largest_costs
-from phasemark.matcher.estimate.acceptance import Rules, rank
+from phasemark.matcher.estimate.acceptance import Rules, rank, with_parts
 from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
 from phasemark.matcher.likelihood.auto_background import AutoBackground
 from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
 from phasemark.matcher.likelihood.bank_images import BankModel
+from phasemark.matcher.likelihood.floor_albedo import estimate_floors, fit_before_floors
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
@@ -179,8 +180,19 @@ class LikelihoodMatcher:
         fits = search_views(scene, evidence, evidence.seen, bare)
         if self._setup.unknown and not self._setup.reports_one_surface:
             fits = fit_without_borders(scene, evidence, fits)
+        floors = None
+        if self._stated is not None and self._stated.estimates_floor_albedo:
+            floors = estimate_floors(self._setup, self._rendered, evidence, fits, self._stated)
+            scene = replace(scene, final=self._rendered.with_background(*floors.backgrounds))
+            fits = fit_before_floors(scene, evidence, fits)
         fits = with_profiles(scene, evidence, fits)
-        answers = rank(self._setup.rules, fits, self._doubt(fits), bare, [self._stated] * len(frames))
+        backgrounds = [self._stated] * len(frames) if floors is None else floors.backgrounds
+        answers = rank(self._setup.rules, fits, self._doubt(fits), bare, backgrounds)
+        if floors is not None:
+            answers = [
+                with_parts(self._setup.rules, match, {"floor_albedo": part})
+                for match, part in zip(answers, floors.part, strict=True)
+            ]
         answers = self._with_mirror(evidence, answers, scene.search)
         return self._with_shared_errors(frames, evidence, answers)
 

@@ -52,6 +52,8 @@ _SNAP_M = 2e-3
 """Heights of the floor below the landmark that count as the same."""
 _STEP_SHARE, _STEP_RAD = 0.06, math.radians(6.0)
 """Steps of the grid of nodes: of the logarithm of the distance, and of the angle δ."""
+_ALBEDOS = 0.5 - 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3)
+"""Albedos of the floor at which nodes are computed: light is a polynomial in it, of which the square suffices."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
 _SMALL = 3e-3
@@ -202,6 +204,7 @@ class StandingLight:
         first = [math.floor(p) - 1 for p in place]
         weights = [_cubic(p - f - 1) for p, f in zip(place, first, strict=True)]
         around = round(2 * math.pi / _STEP_RAD)
+        shares = _lagrange(_ALBEDOS, view.floor_albedo)
         found, at_sheets = None, None
         for a, weight_a in enumerate(weights[0]):
             distance_m = math.exp(_STEP_SHARE * (first[0] + a))
@@ -212,7 +215,7 @@ class StandingLight:
                 turn = (first[1] + b) % around
                 name = (
                     key, bounces, first[0] + a, turn, axis,
-                    view.wall_m, view.floor_m, round(view.lens[2] / _SNAP_M), view.wall_albedo, view.floor_albedo,
+                    view.wall_m, view.floor_m, round(view.lens[2] / _SNAP_M), view.wall_albedo,
                 )  # fmt: skip
                 with self._lock:
                     node = self._nodes.get(name)
@@ -220,8 +223,9 @@ class StandingLight:
                     node = self._solved(stand, self._node_view(view, distance_m, turn * _STEP_RAD, axis), bounces)
                     with self._lock:
                         self._nodes[name] = node
-                found = weight * node[0] if found is None else found + weight * node[0]
-                at_sheets = weight * node[1] if at_sheets is None else at_sheets + weight * node[1]
+                own = [values @ (weight * shares) for values in node]
+                found = own[0] if found is None else found + own[0]
+                at_sheets = own[1] if at_sheets is None else at_sheets + own[1]
         assert found is not None
         assert at_sheets is not None
         scale = self._scale(view.distance_m)
@@ -353,7 +357,10 @@ class StandingLight:
     def _solved(
         self, stand: Stand, view: StandingView, bounces: float
     ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`."""
+        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`.
+
+        (frequencies, n, albedos of the floor) and (frequencies, w, albedos).
+        """
         patches, sheets = stand.patches, self._sheets(view)
         n, k = patches.weights.shape
         whole = np.ones(n)
@@ -361,26 +368,30 @@ class StandingLight:
             ahead = np.array([math.cos(view.delta_rad), math.sin(view.delta_rad), 0.0])
             beyond = (patches.centre - view.lens) @ ahead - (view.wall_m - sheets.depth_m)
             whole = np.where(patches.body == _FLOOR, np.clip(0.5 - beyond / patches.size, 0.0, 1.0), 1.0)
-        returned = whole * np.where(patches.body == _LANDMARK, self._albedo * patches.albedo, view.floor_albedo)
+        own = patches.body == _LANDMARK
+        returned = whole[:, None] * np.where(own[:, None], (self._albedo * patches.albedo)[:, None], _ALBEDOS)
         lifted = patches.points + patches.lift_m * patches.normals
         light, way = self._lamp(lifted.reshape(-1, 3), patches.normals.reshape(-1, 3), view, patches)
         light *= patches.weights.ravel()
         coupled = None if sheets is None else self._coupled(stand, sheets, view)
         found, at_sheets = [], []
         for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
-            term = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
+            lamp = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
+            term, of_sheets = (
+                np.repeat(lamp[:, None], len(_ALBEDOS), axis=1),
+                np.zeros((0, len(_ALBEDOS)), np.complex128),
+            )
             if coupled is not None:
                 to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
-            else:
-                of_sheets = np.zeros(0, np.complex128)
-            total, total_sheets = np.zeros(n, np.complex128), np.zeros_like(of_sheets)
+            total, total_sheets = np.zeros_like(term), np.zeros_like(of_sheets)
             size, before, last, done = 0.0, 0.0, 0.0, 0
             while done < bounces and np.abs(term).max(initial=0.0) > _SMALL * size:
                 sent = returned * term
                 term = operator @ sent.astype(np.complex64)
                 if coupled is not None:
-                    term = term + (to_groups @ of_sheets)[stand.group]
-                    of_sheets = from_groups @ (stand.mean @ sent) + among @ of_sheets
+                    from_sheets = coupled.albedo * of_sheets
+                    term = term + (to_groups @ from_sheets)[stand.group]
+                    of_sheets = from_groups @ (stand.mean @ sent) + among @ from_sheets
                 total, total_sheets, done = total + term, total_sheets + of_sheets, done + 1
                 before, last = last, float(np.abs(term).max(initial=0.0))
                 size = last if done == 1 else size
@@ -389,7 +400,7 @@ class StandingLight:
                 total, total_sheets = total + rest * term, total_sheets + rest * of_sheets
             found.append(total)
             at_sheets.append(total_sheets)
-        scale = 1 / self._scale(view.distance_m)
+        scale = 1 / self._scale(view.distance_m)[:, :, None]
         return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
 
     def _coupled(self, stand: Stand, sheets: Sheets, view: StandingView) -> _Coupled:
@@ -408,7 +419,7 @@ class StandingLight:
         normals = np.repeat(sheets.normal, points.shape[1], axis=0)
         light, way = self._lamp(points.reshape(-1, 3) + lift * normals, normals, view, stand.patches)
         n = sheets.n_wall
-        albedo = np.where(np.arange(len(sheets.area)) < n, view.wall_albedo, view.floor_albedo)
+        albedo = np.where((np.arange(len(sheets.area)) < n)[:, None], view.wall_albedo, _ALBEDOS)
         key = view.wall_m, view.floor_m, sheets.depth_m
         if key not in self._among:
             self._among = {**self._among, key: sheets.between()}
@@ -428,8 +439,10 @@ class _Coupled(NamedTuple):
         Between groups and sheets: cos θ cos θ' / (π d²), and d.
     among, apart : (w, w) float64
         Form factors between sheets, and their distances.
-    area, albedo : (w,) float64
+    area : (w,) float64
         Of the sheets.
+    albedo : (w, albedos) float64
+        Of the sheets, by that of the floor.
     light, way : (w, 16) float64
         Of the lamp, at points of the sheets, and their distance from it.
     """
@@ -444,9 +457,7 @@ class _Coupled(NamedTuple):
     way: NDArray[np.float64]
 
     def operators(self, wave_number: float, group_area: NDArray[np.float64]) -> tuple[NDArray[np.complex128], ...]:
-        """Return what carries light from sheets to groups, from groups to sheets and among sheets, and the lamp's at them.
-
-        Light that arrives at sheets is carried on with their albedo; that of groups is what leaves them.
+        """Return what carries light from sheets to groups, back, and among sheets; and the lamp's light at the sheets.
 
         Parameters
         ----------
@@ -454,9 +465,10 @@ class _Coupled(NamedTuple):
         group_area : (g,) float64
         """
         turned = self.exchange * np.exp(1j * wave_number * self.distance)
-        among = self.among * np.exp(1j * wave_number * self.apart) * self.albedo
+        among = self.among * np.exp(1j * wave_number * self.apart)
         lamp = (self.light * np.exp(1j * wave_number * self.way)).mean(axis=1)
-        return turned * (self.area * self.albedo), (turned * group_area[:, None]).T, among, lamp
+        at_lamp = np.repeat(lamp[:, None], self.albedo.shape[1], axis=1)
+        return turned * self.area, (turned * group_area[:, None]).T, among, at_lamp
 
 
 def _sizes(mesh: MeshTopology, floor_z_m: float | None) -> SizeAt:
@@ -503,6 +515,14 @@ def _with_floor(mesh: MeshTopology, floor_z_m: float | None) -> MeshTopology:
     attributes = {"part": part.astype(np.int32), "albedo": albedo}
     found = topology_of(trimesh.Trimesh(vertices, faces, process=False, face_attributes=attributes))
     return found._replace(closed=(found.part == _LANDMARK) & bool(mesh.closed.all()))
+
+
+def _lagrange(places: NDArray[np.float64], at: float) -> NDArray[np.float32]:
+    """Return the weights of values at some places in the polynomial through them."""
+    apart = places[:, None] - places
+    np.fill_diagonal(apart, 1.0)
+    ways = np.where(np.eye(len(places), dtype=np.bool_), 1.0, at - places)
+    return np.asarray((ways / apart).prod(axis=1), np.float32)
 
 
 def _cubic(share: float) -> NDArray[np.float64]:
