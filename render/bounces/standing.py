@@ -50,13 +50,13 @@ _GROUP = 2.0
 """Size of groups of patches, which exchange light with the wall, in sizes of patches."""
 _SNAP_M = 2e-3
 """Heights of the floor below the landmark that count as the same."""
-_STEP_SHARE, _STEP_RAD = 0.06, math.radians(6.0)
+_STEP_SHARE, _STEP_RAD = 0.09, math.radians(7.5)
 """Steps of the grid of nodes: of the logarithm of the distance, and of the angle δ."""
 _ALBEDOS = 0.5 - 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3)
 """Albedos of the floor at which nodes are computed: light is a polynomial in it, of which the square suffices."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
-_SMALL = 3e-3
+_SMALL = 5e-3
 """Share of the first bounce below which later ones are taken as a geometric series."""
 _NEARBY_M = 1e-2
 _FINEST_M, _FARTHEST_M = 0.1, 20.0
@@ -384,8 +384,8 @@ class StandingLight:
             if coupled is not None:
                 to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
             total, total_sheets = np.zeros_like(term), np.zeros_like(of_sheets)
-            size, before, last, done = 0.0, 0.0, 0.0, 0
-            while done < bounces and np.abs(term).max(initial=0.0) > _SMALL * size:
+            size, before, last, done = 0.0, np.zeros(0), np.abs(term).sum(axis=0), 0
+            while done < bounces and last.max() > _SMALL * size:
                 sent = returned * term
                 term = operator @ sent.astype(np.complex64)
                 if coupled is not None:
@@ -393,9 +393,9 @@ class StandingLight:
                     term = term + (to_groups @ from_sheets)[stand.group]
                     of_sheets = from_groups @ (stand.mean @ sent) + among @ from_sheets
                 total, total_sheets, done = total + term, total_sheets + of_sheets, done + 1
-                before, last = last, float(np.abs(term).max(initial=0.0))
-                size = last if done == 1 else size
-            if done < bounces and last < before:  # what is left falls off as a geometric series
+                before, last = last, np.abs(term).sum(axis=0)
+                size = float(last.max()) if done == 1 else size
+            if done < bounces and (last < before).all():  # what is left falls off as a geometric series
                 rest = last / (before - last)
                 total, total_sheets = total + rest * term, total_sheets + rest * of_sheets
             found.append(total)
