@@ -254,6 +254,8 @@ class Matcher:
             return
         if systematic is not None or policy is not None:
             raise UsageError("'systematic' and 'policy' belong to method 'refine', not 'nearest'")
+        if isinstance(background, Background) and background.bounces:
+            raise UsageError("light that bounces belongs to method 'refine', not 'nearest': leave 'bounces' out")
         fixed = free is None or tuple(free) == VIEW[:2]
         if not fixed or on != "ranges" or pixels != "all" or robust or isinstance(background, str):
             raise UsageError(

@@ -15,6 +15,7 @@ from phasemark.data.commands.command import Shown, Without
 from phasemark.data.commands.console import LongWork, echo, echo_facts, readable
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, open_frame_set, read_sensor
 from phasemark.data.commands.options import (
+    BouncesOfLight,
     Building,
     Count,
     Degrees,
@@ -208,6 +209,7 @@ def frames_simulate(
     view: View,
     wall: Wall = None,
     floor: Floor = None,
+    bounces: BouncesOfLight = "0",
     moving: Annotated[bool, Shown("--moving/--still")] = False,
     to_distance: Metres | None = None,
     to_delta: Degrees | None = None,
@@ -263,7 +265,7 @@ def frames_simulate(
         views,
         seed=seed,
         albedo=mesh.metadata.get("albedo", 0.8),
-        background=background_of(wall, floor),
+        background=background_of(wall, floor, bounces),
     )
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"

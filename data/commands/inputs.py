@@ -135,11 +135,21 @@ def name_and_file(text: str) -> tuple[str, str]:
     return name, path
 
 
-def background_of(wall: float | None, floor: float | None) -> Background | None:
-    """Return the background that the options state; None without wall and floor."""
+def background_of(wall: float | None, floor: float | None, bounces: str = "0") -> Background | None:
+    """Return the background that the options state; None without wall and floor.
+
+    Raises
+    ------
+    UsageError
+        Light is to bounce off nothing.
+    """
     from phasemark.render import Background
 
-    return None if wall is None and floor is None else Background(wall_m=wall, floor_m=floor)
+    if wall is None and floor is None:
+        if bounces != "0":
+            raise UsageError("--bounces needs something that light bounces off: give --wall, --floor or both")
+        return None
+    return Background(wall_m=wall, floor_m=floor, bounces="all" if bounces == "all" else int(bounces))
 
 
 def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None], *, in_histograms: bool = False) -> None:

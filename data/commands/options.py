@@ -67,6 +67,10 @@ Origin = Annotated[OriginWord, Shown(help=_ORIGIN_HELP)]
 MeshUnit = Annotated[MeshUnitWord | None, Shown(help="Unit of the mesh file: m, cm, mm or inch.")]
 Wall = Annotated[Metres | None, Shown(help="Distance of a wall behind the landmark.")]
 Floor = Annotated[Metres | None, Shown(help="How far a floor lies below the lens.")]
+BouncesOfLight = Annotated[
+    Literal["0", "1", "2", "all"],
+    Shown("--bounces", help="How often light may bounce between landmark, wall and floor on its way."),
+]
 Resume = Annotated[bool, Shown(help="Continue an unfinished run of the same plan.")]
 Sample = Annotated[Index, Shown(help="Number of random items that are rendered again.")]
 Workers = Annotated[Count | None, Shown(help="Threads; the result does not depend on it.")]

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from phasemark.data.commands.console import echo
 from phasemark.data.commands.inputs import ClassOrMesh, background_of, note_too_far, read_sensor
-from phasemark.data.commands.options import Floor, Force, Out, SensorName, View, Wall
+from phasemark.data.commands.options import BouncesOfLight, Floor, Force, Out, SensorName, View, Wall
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def render_frame(
     sensor: SensorName = "pmd-16x16",
     wall: Wall = None,
     floor: Floor = None,
+    bounces: BouncesOfLight = "0",
     variant: Literal["exact", "hard"] = "exact",
     force: Force = False,
 ) -> None:
@@ -53,7 +54,7 @@ def render_frame(
     renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
     views = view.views(view.distance, view.delta)
     renderer.check_in_view(views)
-    background = background_of(wall, floor)
+    background = background_of(wall, floor, bounces)
     image = renderer.render_views(views, background=background, variant=variant)
     histograms = None
     if camera.histogram is not None and variant == "exact":

@@ -408,6 +408,8 @@ def _check_choices(bank: Bank, background: object, on: str) -> None:
         raise UsageError(f"the bank's model is '{bank.plan.model}', which knows no mixed pixels: refine needs 'ray'")
     if background == "unknown" and on != "ranges":
         raise UsageError('background="unknown" takes on="ranges": the brightness of unknown things tells nothing')
+    if isinstance(background, Background) and background.estimates_floor_albedo and on != "ranges":
+        raise UsageError("'floor_albedo_std' takes on=\"ranges\": state the floor's albedo, and 0")
     if background == "auto" and layers_of(bank) is not None:
         raise UsageError('background="auto" takes on="ranges" with several modulation frequencies')
 
