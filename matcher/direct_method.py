@@ -133,7 +133,7 @@ def with_direct_errors(
     Parameters
     ----------
     rules : Rules
-    systematic : collection of {"calibration", "recording", "declared", "motion"}
+    systematic : collection of {"calibration", "recording", "declared", "multipath", "motion"}
     sensor : Sensor
         Of the frames.
     time_s : (n, frames) float64, optional

@@ -105,7 +105,7 @@ class Matcher:
         0, or the pitch and roll that frames state; infinite where nothing is known. Where pitch or roll is not free, it
         is as stated. Starts are looked for up to three of them away, within a quarter of the
         image.
-    systematic : collection of {"calibration", "recording", "declared", "motion"}, optional
+    systematic : collection of {"calibration", "recording", "declared", "multipath", "motion"}, optional
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
         of the frames' sensor leaves, what differs in another recording than those that calibrated it, what the sensor
         declares of a pose, and what the jitter of its stamps makes of the camera's motion. None: all; of histograms and

@@ -47,7 +47,7 @@ def with_shared_errors(
     setup : Setup
     rendered : callable
         Returns what renders the landmarks; called where a calibration has to be carried into a view.
-    systematic : collection of {"calibration", "recording", "declared", "motion"}
+    systematic : collection of {"calibration", "recording", "declared", "multipath", "motion"}
     sensor : Sensor
         Of the frames.
     evidence : Evidence
@@ -60,14 +60,19 @@ def with_shared_errors(
     if "declared" in systematic and declared.any():
         for k in known:
             parts[k]["declared"] = declared
-    if terms := carried_errors(sensor, systematic):
+    known_behind = answers[known[0]].background if known else None
+    if terms := carried_errors(sensor, systematic, known_behind):
         for c, name in enumerate(setup.rules.names):
-            which = [k for k in known if answers[k].class_name == name]
-            if which:
-                carried = _carried(setup, rendered(), sensor, evidence, c, which, [answers[k] for k in which], terms)
-                for term, some in carried.items():
-                    for k, part in zip(which, some, strict=True):
-                        parts[k][term] = part
+            own = [k for k in known if answers[k].class_name == name]
+            for accepted in (True, False):  # how light bounces takes long to find out
+                which = [k for k in own if answers[k].accepted == accepted]
+                some = {term: one for term, one in terms.items() if accepted or term != "multipath"}
+                if which and some:
+                    matches = [answers[k] for k in which]
+                    carried = _carried(setup, rendered(), sensor, evidence, c, which, matches, some)
+                    for term, of_frames in carried.items():
+                        for k, part in zip(which, of_frames, strict=True):
+                            parts[k][term] = part
     return [with_parts(setup.rules, match, part) if part else match for match, part in zip(answers, parts, strict=True)]
 
 

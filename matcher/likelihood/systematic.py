@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
@@ -21,9 +22,9 @@ from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.sensor.lens_fields import LENS_FIELD
 from phasemark.render.sensor.lens_rates import lens_rates
 
-Systematic = Literal["calibration", "recording", "declared", "motion"]
+Systematic = Literal["calibration", "recording", "declared", "multipath", "motion"]
 """What a calibration leaves of the sensor's fields, what differs in another recording, what the sensor declares of a
-pose, and the jitter of stamps."""
+pose, light that bounces off a floor where it is not modelled, and the jitter of stamps."""
 SYSTEMATICS: tuple[Systematic, ...] = get_args(Systematic)
 
 _STEPS = {
@@ -45,6 +46,14 @@ RECORDING_FIELDS = {
 _LENS_STEP_RAD = math.radians(0.02)
 """How far the width of a difference in a term of the lens moves the point of an image that it moves most."""
 _OFFSET = "range_offset_m"
+_BOUNCES = "floor_albedo"
+SUPPOSED_ALBEDO = 0.5
+"""Albedo of a floor below the landmark whose multipath is not modelled."""
+_LARGEST_ALBEDO = 0.6
+_LOWEST_M = 0.01
+_FLOOR_STEP_M, _WALL_STEP_M = 0.1, 0.1
+_ASKEW = 0.3
+"""How far off the direction is that multipath moves a view in, as a share of the way."""
 
 
 def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
@@ -122,14 +131,19 @@ class Carried(NamedTuple):
     covariance: NDArray[np.float64]
 
 
-def carried_errors(sensor: Sensor, terms: Collection[str]) -> dict[Systematic, Carried]:
-    """Return what the fields of a sensor leave uncertain of what a frame shows, of some terms; no empty ones.
+def carried_errors(
+    sensor: Sensor, terms: Collection[str], background: Background | None = None
+) -> dict[Systematic, Carried]:
+    """Return what the fields of a sensor, and a floor, leave uncertain of what a frame shows; no empty terms.
 
     Parameters
     ----------
     sensor : Sensor
-    terms : collection of {"calibration", "recording", "declared", "motion"}
-        The last two are not carried by fields.
+    terms : collection of {"calibration", "recording", "declared", "multipath", "motion"}
+        "declared" and "motion" are not carried by fields.
+    background : Background, optional
+        What is known to stand behind the landmark. Light that bounces off a floor counts where it is not modelled and
+        the sensor says how wide its lamp shines.
     """
     found: dict[Systematic, Carried] = {}
     if "calibration" in terms:
@@ -143,7 +157,34 @@ def carried_errors(sensor: Sensor, terms: Collection[str]) -> dict[Systematic, C
     if "recording" in terms:
         std = {name: float(getattr(sensor, own)) for name, own in RECORDING_FIELDS.items() if getattr(sensor, own)}
         found["recording"] = Carried(tuple(std), np.diag(np.square(list(std.values()))))
+    modelled = background is not None and background.bounces
+    if "multipath" in terms and not modelled and sensor.lamp_half_angle_deg is not None and sensor.histogram is None:
+        found["multipath"] = Carried((_BOUNCES,), np.array([[_LARGEST_ALBEDO**2]]))
     return {name: one for name, one in found.items() if one.fields}
+
+
+def supposed_floors(renderer: Renderer, views: Views, background: Background | None) -> list[Background | None]:
+    """Return floors off which light may bounce unnoticed: as stated, or where the landmark stands; None above the lens.
+
+    Parameters
+    ----------
+    renderer : Renderer
+    views : Views
+    background : Background, optional
+        What is known to stand there.
+    """
+    known = background or Background()
+    foot_m = -(views.height_m + float(renderer.topology.low[2]))
+    # in steps, for many frames to share what is computed
+    step = _FLOOR_STEP_M
+    below_m = [0.0 if known.floor_m is None else step * round((known.floor_m - own) / step) for own in foot_m]
+    floors_m = [float(own + below) for own, below in zip(foot_m, below_m, strict=True)]
+    if known.wall_m is not None:
+        known = replace(known, wall_m=_WALL_STEP_M * math.ceil(known.wall_m / _WALL_STEP_M))
+    return [
+        replace(known, floor_m=own, floor_albedo=SUPPOSED_ALBEDO, bounces="all") if own > _LOWEST_M else None
+        for own in floors_m
+    ]
 
 
 def calibrated_slopes(
@@ -181,6 +222,12 @@ def calibrated_slopes(
     for k, name in enumerate(names):
         if name == _OFFSET:
             out[:, k] = by_range
+            continue
+        if name == _BOUNCES:
+            floors = supposed_floors(renderer, views, background)
+            direct = [None if own is None else replace(own, bounces=0) for own in floors]
+            found, bare = (renderer.render_views(views, background=own, workers=workers) for own in (floors, direct))
+            out[:, k] = (found.phasor - bare.phasor) / SUPPOSED_ALBEDO
             continue
         moved, step = _beside(renderer.sensor, name)
         there = renderer.seen_by(moved).render_views(views, background=background, workers=workers)
@@ -233,4 +280,6 @@ def carried_covariances(
     for term, one in terms.items():
         own = gain[:, :, [names.index(name) for name in one.fields]]
         found[term] = np.asarray(own @ one.covariance @ own.transpose(0, 2, 1))
+        if term == "multipath":
+            found[term] = found[term] + np.eye(own.shape[1]) * _ASKEW**2 * found[term]
     return found
