@@ -12,7 +12,6 @@ import typer
 from phasemark.cli import app
 
 PAGE = Path(__file__).parent / "commands.md"
-HEADER = ("| option | default | meaning |", "|---|---|---|")
 TITLE = "Options of several commands"
 ANCHOR = TITLE.lower().replace(" ", "-")
 TYPES = {str: "TEXT", int: "INTEGER", float: "NUMBER", Path: "PATH"}
@@ -38,9 +37,9 @@ def commands(command: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield from commands(inner, f"{path} {name}")
 
 
-def cell(text: str) -> str:
-    """Return text as the cell of a table."""
-    return " ".join(text.split()).replace("|", "\\|")
+def one_line(text: str) -> str:
+    """Return text on one line."""
+    return " ".join(text.split())
 
 
 def choices(annotation: Any) -> list[str]:
@@ -65,30 +64,31 @@ def options(command: Any) -> list[Any]:
 
 
 def option_names(option: Any) -> str:
-    """Return the words that state an option."""
-    return ", ".join(f"`{name}`" for name in (*option.opts, *option.secondary_opts))
+    """Return the words that state an option, and what it takes."""
+    takes = "" if option.is_flag else f" {option.metavar or kind(option)}"
+    *others, last = (*option.opts, *option.secondary_opts)
+    return ", ".join(f"`{name}`" for name in (*others, f"{last}{takes}"))
 
 
-def option_row(option: Any) -> str:
-    """Return one line of the table of options."""
-    takes = "" if option.is_flag else f" `{cell(option.metavar or kind(option))}`"
+def option_line(option: Any) -> str:
+    """Return one item of the list of options."""
     if option.required:
-        default = "required"
+        default = " (required)"
     elif option.is_flag or option.default in (None, [], ()) or callable(option.default):
         default = ""
     else:
-        default = f"`{option.default}`"
-    return f"| {option_names(option)}{takes} | {default} | {cell(option.help or '')} |"
+        default = f" (`{option.default}`)"
+    return f"- {option_names(option)}{default}: {one_line(option.help or '')}"
 
 
-def shared_rows(found: list[tuple[str, Any]]) -> list[str]:
-    """Return the lines of options that several commands have; of a name with several meanings the most frequent one."""
+def shared_lines(found: list[tuple[str, Any]]) -> list[str]:
+    """Return the lines of options that several commands have; of one with several meanings the most frequent one."""
     of_commands = [option for _, command in found for option in options(command) if not option.required]
-    rows = Counter((option_names(option), option_row(option)) for option in of_commands)
+    lines = Counter((option_names(option), option_line(option)) for option in of_commands)
     shared: dict[str, str] = {}
-    for (names, row), count in rows.most_common():
+    for (names, line), count in lines.most_common():
         if count > 1:
-            shared.setdefault(names, row)
+            shared.setdefault(names, line)
     return [shared[names] for names in sorted(shared)]
 
 
@@ -96,31 +96,35 @@ def section(path: str, command: Any, shared: list[str]) -> str:
     """Return what the page says of one command; options with a shared line are named only."""
     arguments = [one for one in command.params if one.param_type_name == "argument"]
     words = [one.metavar or one.name.upper() for one in arguments]
-    paragraphs = [" ".join(part.split()) for part in (command.help or "").split("\n\n")]
-    lines = [f"## {path}", "", f"    {' '.join([path, *words, '[OPTIONS]'])}", ""]
-    for paragraph in paragraphs:
-        lines += [paragraph, ""]
+    lines = [f"## {path}", ""]
     if arguments:
-        lines += ["| argument | meaning |", "|---|---|"]
-        lines += [
-            f"| `{cell(word)}` | {cell(getattr(one, 'help', None) or '')} |"
-            for word, one in zip(words, arguments, strict=True)
-        ]
-        lines.append("")
-    own = [row for row in map(option_row, options(command)) if row not in shared]
+        lines += [f"    {' '.join([path, *words, '[OPTIONS]'])}", ""]
+    for paragraph in (command.help or "").split("\n\n"):
+        lines += [one_line(paragraph), ""]
+    own = [
+        f"- `{word}`: {one_line(getattr(one, 'help', None) or '')}" for word, one in zip(words, arguments, strict=True)
+    ]
+    own += [line for line in map(option_line, options(command)) if line not in shared]
+    named = [option_name(option, shared) for option in options(command) if option_line(option) in shared]
     if own:
-        lines += [*HEADER, *own, ""]
-    named = [option_names(option) for option in options(command) if option_row(option) in shared]
+        lines += [*own, ""]
     if named:
-        lines += [f"{'Also' if own else 'Options'} [explained above](#{ANCHOR}): {'; '.join(named)}.", ""]
+        lines += [f"[Shared options](#{ANCHOR}): {', '.join(named)}.", ""]
     return "\n".join(lines)
+
+
+def option_name(option: Any, shared: list[str]) -> str:
+    """Return the name of an option with a shared line, and what it takes if another shared option has the name."""
+    name = f"`{option.opts[0]}"
+    alone = sum(line.startswith((f"- {name}`", f"- {name} ")) for line in shared) == 1
+    return f"{name}`" if alone else option_names(option)
 
 
 def page() -> str:
     """Return the whole page."""
     found = list(commands(typer.main.get_command(app), "phasemark"))
-    shared = shared_rows(found)
-    common = [f"## {TITLE}", "", *HEADER, *shared, ""]
+    shared = shared_lines(found)
+    common = [f"## {TITLE}", "", "In brackets: the default.", "", *shared, ""]
     return "\n".join([INTRODUCTION, *common, *(section(*one, shared) for one in found)])
 
 

@@ -62,9 +62,9 @@ Out = Annotated[Path, Shown("-o", "--out")]
 Shards = Annotated[list[Path], Shown(metavar="SHARD...", help="All parts that --shard has built.")]
 Json = Annotated[bool, Shown("--json", help="Print JSON instead of text.")]
 Force = Annotated[bool, Shown(help="Replace an output that exists.")]
-Up = Annotated[UpWord, Shown(help="Axis of the mesh file that points up: x, y, z, -x, -y or -z.")]
+Up = Annotated[UpWord, Shown(help="Axis of the mesh file that points up.")]
 Origin = Annotated[OriginWord, Shown(help=_ORIGIN_HELP)]
-MeshUnit = Annotated[MeshUnitWord | None, Shown(help="Unit of the mesh file: m, cm, mm or inch.")]
+MeshUnit = Annotated[MeshUnitWord | None, Shown(help="Unit of the mesh file.")]
 Wall = Annotated[Metres | None, Shown(help="Distance of a wall behind the landmark.")]
 Floor = Annotated[Metres | None, Shown(help="How far a floor lies below the lens.")]
 BouncesOfLight = Annotated[
@@ -83,11 +83,11 @@ class FrameReading:
     Parameters
     ----------
     unit
-        Unit of measured frames: m, cm or mm; if the file does not say.
+        Unit of measured frames, if the file does not say.
     quantity
-        range (along the ray) or z (along the optical axis); needed where the file does not say it.
+        range (along the ray) or z (along the optical axis), if the file does not say.
     invalid_means
-        Meaning of an invalid pixel: missing (not measured) or no-return.
+        Meaning of an invalid pixel; missing: not measured.
     valid_status
         Value of 'status' that marks a valid pixel; repeatable.
     flip_h
@@ -95,7 +95,7 @@ class FrameReading:
     flip_v
         Mirror top and bottom.
     rotate
-        Turn the image clockwise by 0, 90, 180 or 270 degrees.
+        Turn the image clockwise, degrees.
     board
         Program of a board that printed the file, if several print the same.
     """

@@ -258,7 +258,7 @@ def sensor_fit(
     distance_std
         Standard deviation of the distances, one for all or one for each; 0.001 is assumed.
     amplitude_unit
-        Unit of amplitude and intensity: electrons or arbitrary.
+        Unit of amplitude and intensity.
     """
     from phasemark.render.bench.fit.fit_sensor import fit_sensor
 

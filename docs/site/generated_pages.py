@@ -9,7 +9,7 @@ import itertools
 import json
 import re
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -249,7 +249,17 @@ def _axes_table() -> list[str]:
     return [*lines, ""]
 
 
-KEYS_HEADER = ("| key | takes | default | meaning |", "|---|---|---|---|")
+def _keys_table(rows: Iterable[str]) -> list[str]:
+    """Return a table of keys; neighbours that differ in their names alone share a row."""
+    lines = ["| key | takes | default | meaning |", "|---|---|---|---|"]
+    for rest, same in itertools.groupby(rows, key=lambda row: row.partition(" | ")[2]):
+        lines.append(f"| {', '.join(f'`{_key_of(row)}`' for row in same)} | {rest}")
+    return [*lines, ""]
+
+
+def _key_of(row: str) -> str:
+    """Return the key that a row explains."""
+    return row.split("`")[1]
 
 
 def plans_page() -> str:
@@ -265,12 +275,13 @@ def plans_page() -> str:
     tables: dict[str, dict[str, Any]] = {}
     schemas = {kind: plan_schema(kind) for kind in KINDS}
     counts = Counter(row for schema in schemas.values() for row in _rows(schema, schema))
-    shared = [row for row, count in counts.items() if count > 1]
-    lines += ["## Keys of several kinds of plan", "", *KEYS_HEADER, *shared, ""]
+    shared = {_key_of(row): row for row, count in reversed(counts.items()) if count > 1}
+    lines += ["## Keys of several kinds of plan", "", *_keys_table(reversed(shared.values()))]
     for kind, schema in schemas.items():
         rows = list(_rows(schema, schema))
-        lines += [f"## A plan of kind `{kind}`", "", *KEYS_HEADER, *(row for row in rows if row not in shared), ""]
-        named = [row.split()[1] for row in rows if row in shared]
+        own = [row for row in rows if row not in shared.values()]
+        lines += [f"## A plan of kind `{kind}`", "", *_keys_table(own)]
+        named = [f"`{_key_of(row)}`" for row in rows if row not in own]
         if named:
             lines += [f"Also [explained above](#keys-of-several-kinds-of-plan): {', '.join(named)}.", ""]
         tables.update(schema.get("$defs", {}))
@@ -278,7 +289,7 @@ def plans_page() -> str:
     lines += ["## Tables within plans", "", *_axes_table()]
     for name, model in sorted(tables.items()):
         if model.get("properties"):
-            lines += [f"### {name}", "", *KEYS_HEADER, *_rows({}, model), ""]
+            lines += [f"### {name}", "", *_keys_table(_rows({}, model))]
         else:
             lines += [f"### {name}", "", _type({}, model), ""]
     return "\n".join(lines)

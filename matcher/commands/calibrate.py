@@ -77,11 +77,10 @@ def calibrate_camera(
 ) -> None:
     """Find how a camera is mounted from frames of a landmark taken at known positions.
 
-    Pitch, roll, height, bearing, field of view, range offset, from amplitudes the landmark's albedo, and with --moving
-    the delay of the stamps: --free and --fix take pitch, roll, height, bearing, half_angle_h, half_angle_v (both: fov),
-    range_offset, albedo and delay. A sensor with a lens has its terms in place of half angles, estimated where --free
-    names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted is not written (exit code 3)
-    without --write-distrusted.
+    Estimated are, by the names that --free and --fix take: pitch, roll, height, bearing, half_angle_h, half_angle_v
+    (both: fov), range_offset, from amplitudes the landmark's albedo, and with --moving the delay of the stamps. A
+    sensor with a lens has its terms in place of half angles, estimated where --free names them: fx, fy, cx, cy, k1,
+    k2 ... (all: lens). A result that cannot be trusted is not written (exit code 3) without --write-distrusted.
 
     Parameters
     ----------

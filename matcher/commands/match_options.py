@@ -58,7 +58,7 @@ class Search:
     Parameters
     ----------
     filter_name
-        How frames are averaged: kalman or phasor-mean.
+        How frames are averaged.
     method
         refine: maximum likelihood, with covariance. nearest: the paper's minimum-distance classifier. Unless stated:
         refine, or nearest where the bank knows no mixed pixels.

@@ -40,7 +40,7 @@ def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = Fals
     file
         A plan (.toml).
     kind
-        bank, frames, scenes, sweep, drive or design, if the plan leaves it open.
+        Kind of the plan, if it leaves it open.
     """
     from phasemark.data.plans.bank_plan import ScenePlan
     from phasemark.matcher.drive import DrivePlan
