@@ -115,9 +115,9 @@ def test_a_page_made_from_the_program_is_up_to_date(name):
 
 
 def test_every_key_of_every_plan_has_a_meaning():
-    rows = [line for line in module("generated_pages").plans_page().splitlines() if line.startswith("| `")]
-    assert len(rows) > 100
-    assert [row for row in rows if not row.split(" | ")[-1].strip("| ")] == []
+    items = [line for line in module("generated_pages").plans_page().splitlines() if line.startswith("- `")]
+    assert len(items) > 100
+    assert [item for item in items if not item.partition("): ")[2].strip()] == []
 
 
 @pytest.mark.parametrize(

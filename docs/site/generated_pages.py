@@ -140,7 +140,7 @@ def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
         return f"table of {_type(schema, inner)}" if isinstance(inner, dict) else "table"
     words = {
         "number": "number",
-        "integer": "whole number",
+        "integer": "integer",
         "string": "text",
         "boolean": "true or false",
         "null": "none",
@@ -164,7 +164,7 @@ def _items(schema: dict[str, Any], key: dict[str, Any]) -> str:
 
 def _plural(kind: str) -> str:
     """Return a kind of value in the plural; words of the program and names of tables stay as they are."""
-    for one, many in (("whole number", "whole numbers"), ("number", "numbers"), ("text", "texts"), ("list", "lists")):
+    for one, many in (("integer", "integers"), ("number", "numbers"), ("text", "texts"), ("list", "lists")):
         if kind.startswith(one):
             return many + kind.removeprefix(one)
     return kind
@@ -224,42 +224,40 @@ def _stated(value: object) -> str:
     return "none" if value is None else f"`{str(value).lower() if isinstance(value, bool) else value}`"
 
 
-def _rows(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
+def _items_of(schema: dict[str, Any], model: dict[str, Any]) -> Iterator[str]:
     required = model.get("required", [])
     explained = _explained(model.get("description", ""))
     for name, key in model.get("properties", {}).items():
         taken = AXES_LINK if key.get("properties") == AXES_SCHEMA["properties"] else _type(schema, key)
         default = "required" if name in required else _default(key["default"], taken) if "default" in key else "empty"
         text = explained.get(name) or explained.get(f"{name}_name") or key.get("description", "")
-        text = without_roles(" ".join(text.split())).replace("|", "\\|")
-        yield f"| `{name}` | {taken} | {default} | {text} |"
+        yield f"- `{name}` ({taken}; {default}): {without_roles(' '.join(text.split()))}"
 
 
 AXES_LINK = "table of [axes](#axes-of-a-sweep)"
 
 
-def _axes_table() -> list[str]:
+def _list_of_axes() -> list[str]:
     """Return the section of the axes of a sweep."""
     explained = _explained(inspect.cleandoc(Condition.__doc__ or ""))
     lines = ["### Axes of a sweep", "", "Each takes one value, a list of values, or `START:STOP:STEP` as a text.", ""]
-    lines += ["| axis | takes | default | meaning |", "|---|---|---|---|"]
     for name, axis in AXES_SCHEMA["properties"].items():
         value, default = axis["anyOf"][1], _stated(getattr(Condition, name))
-        lines.append(f"| `{name}` | {_type({}, value)} | {default} | {explained[name]} |")
+        lines.append(f"- `{name}` ({_type({}, value)}; {default}): {explained[name]}")
     return [*lines, ""]
 
 
-def _keys_table(rows: Iterable[str]) -> list[str]:
-    """Return a table of keys; neighbours that differ in their names alone share a row."""
-    lines = ["| key | takes | default | meaning |", "|---|---|---|---|"]
-    for rest, same in itertools.groupby(rows, key=lambda row: row.partition(" | ")[2]):
-        lines.append(f"| {', '.join(f'`{_key_of(row)}`' for row in same)} | {rest}")
+def _list_of_keys(items: Iterable[str]) -> list[str]:
+    """Return a list of keys; neighbours that differ in their names alone share an item."""
+    lines = []
+    for rest, same in itertools.groupby(items, key=lambda item: item.partition("` ")[2]):
+        lines.append(f"- {', '.join(f'`{_key_of(item)}`' for item in same)} {rest}")
     return [*lines, ""]
 
 
-def _key_of(row: str) -> str:
-    """Return the key that a row explains."""
-    return row.split("`")[1]
+def _key_of(item: str) -> str:
+    """Return the key that an item explains."""
+    return item.split("`")[1]
 
 
 def plans_page() -> str:
@@ -269,27 +267,31 @@ def plans_page() -> str:
         "",
         "Generated from the program by `make pages`; do not edit. A plan is a TOML file: what is built or run. "
         "`phasemark plan example KIND` prints one, `phasemark plan check FILE` says what is wrong with one, and "
-        "`phasemark plan schema KIND` prints the JSON Schema from which this page is made.",
+        "`phasemark plan schema KIND` prints the JSON Schema from which this page is made. In brackets: what a key "
+        "takes, and its default.",
         "",
     ]
     tables: dict[str, dict[str, Any]] = {}
     schemas = {kind: plan_schema(kind) for kind in KINDS}
-    counts = Counter(row for schema in schemas.values() for row in _rows(schema, schema))
-    shared = {_key_of(row): row for row, count in reversed(counts.items()) if count > 1}
-    lines += ["## Keys of several kinds of plan", "", *_keys_table(reversed(shared.values()))]
+    counts = Counter(item for schema in schemas.values() for item in _items_of(schema, schema))
+    shared: dict[str, str] = {}
+    for item, count in counts.items():
+        if count > 1:
+            shared.setdefault(_key_of(item), item)
+    lines += ["## Keys of several kinds of plan", "", *_list_of_keys(shared.values())]
     for kind, schema in schemas.items():
-        rows = list(_rows(schema, schema))
-        own = [row for row in rows if row not in shared.values()]
-        lines += [f"## A plan of kind `{kind}`", "", *_keys_table(own)]
-        named = [f"`{_key_of(row)}`" for row in rows if row not in own]
+        items = list(_items_of(schema, schema))
+        own = [item for item in items if item not in shared.values()]
+        lines += [f"## A plan of kind `{kind}`", "", *_list_of_keys(own)]
+        named = [f"`{_key_of(item)}`" for item in items if item not in own]
         if named:
             lines += [f"Also [explained above](#keys-of-several-kinds-of-plan): {', '.join(named)}.", ""]
         tables.update(schema.get("$defs", {}))
     tables[Distribution.__name__] = Distribution.model_json_schema()
-    lines += ["## Tables within plans", "", *_axes_table()]
+    lines += ["## Tables within plans", "", *_list_of_axes()]
     for name, model in sorted(tables.items()):
         if model.get("properties"):
-            lines += [f"### {name}", "", *_keys_table(_rows({}, model))]
+            lines += [f"### {name}", "", *_list_of_keys(_items_of({}, model))]
         else:
             lines += [f"### {name}", "", _type({}, model), ""]
     return "\n".join(lines)
