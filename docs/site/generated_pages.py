@@ -71,8 +71,9 @@ def reference_page(*, linked: bool) -> str:
     def label(module: str, name: str) -> str:
         return f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
 
-    modules = ["## Modules within the rooms", "", "| module | names |", "|---|---|"]
-    for module, names in public_names().items():
+    modules = ["## Modules within the rooms", "", "| module | names beside those of its room |", "|---|---|"]
+    public = public_names()
+    for module, names in public.items():
         thing = importlib.import_module(module)
         if module in ROOMS:
             heading = f"[{module}]({reference_path(module)})" if linked else module
@@ -81,7 +82,8 @@ def reference_page(*, linked: bool) -> str:
             lines.append("")
         else:
             place = f"[`{module}`]({reference_path(module)})" if linked else f"`{module}`"
-            named = ", ".join(label(module, name) for name in names)
+            of_room = public[".".join(module.split(".")[:2])] if module.count(".") > 1 else []
+            named = ", ".join(label(module, name) for name in names if name not in of_room)
             modules.append(f"| {place} | {named} |")
     return "\n".join([*lines, *modules, ""])
 
@@ -130,7 +132,8 @@ def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
         return f"number or {_linked(Distribution.__name__)}"
     for several in ("anyOf", "oneOf"):
         if several in key:
-            return " or ".join(dict.fromkeys(_type(schema, each) for each in key[several]))
+            stated = [each for each in key[several] if each.get("type") != "null"]  # TOML has no null: left out
+            return " or ".join(dict.fromkeys(_type(schema, each) for each in stated))
     if "enum" in key or "const" in key:
         return ", ".join(f"`{word}`" for word in key.get("enum", [key.get("const")]))
     if key.get("type") == "array":
@@ -143,7 +146,6 @@ def _type(schema: dict[str, Any], key: dict[str, Any]) -> str:
         "integer": "integer",
         "string": "text",
         "boolean": "true or false",
-        "null": "none",
     }
     limits = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
     stated = [f"{sign} {limit(key[name])}" for name, sign in limits.items() if isinstance(key.get(name), int | float)]

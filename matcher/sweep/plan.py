@@ -128,9 +128,9 @@ class Method(PlanModel):
     filter : {"kalman", "phasor-mean"}
         How the frames of one measurement become one image: a Kalman filter of each pixel's range, or the mean phasor.
     on : {"ranges", "phasors", "reported"}, optional
-        What ``refine`` explains: ranges, or phasors, of which frames are taken without a validity threshold. A sensor
-        with a [histogram] table gives the ranges that its chip reports, and unless stated these are explained:
-        "reported", among unknown things, whatever `knows` says.
+        Quantity that ``refine`` explains. Phasors take frames without a validity threshold. Unless stated: ranges, or
+        of a sensor with a [histogram] table the ranges that its chip reports, among unknown things whatever `knows`
+        says.
     pixels : {"all", "lower"}
         Which pixels ``refine`` compares: all, or the lower half of the rows.
     free : sequence of {"bearing", "height", "pitch", "roll"}
