@@ -43,7 +43,7 @@ def first_script_names() -> str:
 def first_line(thing: object) -> str:
     """Return the first sentence of what a docstring says."""
     text = inspect.cleandoc(getattr(thing, "__doc__", None) or "").split("\n\n")[0]
-    return without_roles(" ".join(text.split())).replace("|", "\\|")
+    return without_roles(" ".join(text.split()))
 
 
 def reference_page(*, linked: bool) -> str:
@@ -71,20 +71,20 @@ def reference_page(*, linked: bool) -> str:
     def label(module: str, name: str) -> str:
         return f"[`{name}`]({reference_path(module)}#{described_at(module, name)})" if linked else f"`{name}`"
 
-    modules = ["## Modules within the rooms", "", "| module | names beside those of its room |", "|---|---|"]
+    modules = ["## Modules within the rooms", "", "Names beside those of the room.", ""]
     public = public_names()
     for module, names in public.items():
         thing = importlib.import_module(module)
         if module in ROOMS:
             heading = f"[{module}]({reference_path(module)})" if linked else module
-            lines += [f"## {heading}", "", first_line(thing), "", "| name | what it is |", "|---|---|"]
-            lines += [f"| {label(module, name)} | {_described(thing, name)} |" for name in names]
+            lines += [f"## {heading}", "", first_line(thing), ""]
+            lines += [f"- {label(module, name)}: {_described(thing, name)}" for name in names]
             lines.append("")
         else:
             place = f"[`{module}`]({reference_path(module)})" if linked else f"`{module}`"
             of_room = public[".".join(module.split(".")[:2])] if module.count(".") > 1 else []
             named = ", ".join(label(module, name) for name in names if name not in of_room)
-            modules.append(f"| {place} | {named} |")
+            modules.append(f"- {place}: {named}")
     return "\n".join([*lines, *modules, ""])
 
 
@@ -100,7 +100,7 @@ def _described(module: ModuleType, name: str) -> str:
             if any(isinstance(target, ast.Name) and target.id == name for target in targets):
                 if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant):
                     text = str(after.value.value).split("\n\n")[0]
-                    return without_roles(" ".join(text.split())).replace("|", "\\|")
+                    return without_roles(" ".join(text.split()))
     return ""
 
 
@@ -117,9 +117,9 @@ def reference_pages() -> dict[str, str]:
     pages = {}
     for module, names in public_names().items():
         thing = importlib.import_module(module)
-        rows = [f"| [`{name}`](#{described_at(module, name)}) | {_described(thing, name)} |" for name in names]
+        items = [f"- [`{name}`](#{described_at(module, name)}): {_described(thing, name)}" for name in names]
         body = [line for name in names for line in (f"::: {described_at(module, name)}", "")]
-        head = [f"# {module}", "", first_line(thing), "", "| name | what it is |", "|---|---|", *rows, ""]
+        head = [f"# {module}", "", first_line(thing), "", *items, ""]
         pages[reference_path(module)] = "\n".join([*head, *body])
     return pages
 
@@ -242,7 +242,9 @@ AXES_LINK = "table of [axes](#axes-of-a-sweep)"
 def _list_of_axes() -> list[str]:
     """Return the section of the axes of a sweep."""
     explained = _explained(inspect.cleandoc(Condition.__doc__ or ""))
-    lines = ["### Axes of a sweep", "", "Each takes one value, a list of values, or `START:STOP:STEP` as a text.", ""]
+    takes = "Each takes one value, a list of values, or `START:STOP:STEP` as a text."
+    assumed = "A method takes bearing, height, pitch and roll to be 0 unless it estimates them."
+    lines = ["### Axes of a sweep", "", f"{takes} {assumed}", ""]
     for name, axis in AXES_SCHEMA["properties"].items():
         value, default = axis["anyOf"][1], _stated(getattr(Condition, name))
         lines.append(f"- `{name}` ({_type({}, value)}; {default}): {explained[name]}")

@@ -46,11 +46,11 @@ class Condition:
     n_frames : int
         Number of frames that are averaged.
     bearing_deg : float
-        True bearing of the landmark, degrees; a method takes 0 unless it estimates it.
+        True bearing of the landmark, degrees.
     height_m : float
-        True height of the landmark's origin above the lens, metres; a method takes 0 unless it estimates it.
+        True height of the landmark's origin above the lens, metres.
     pitch_deg, roll_deg : float
-        True tilt of the camera's mount, degrees; a method takes 0 unless it estimates it.
+        True tilt of the camera's mount, degrees.
     albedo : float
         The landmark's true albedo.
     wall_m : float
