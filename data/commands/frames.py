@@ -219,10 +219,9 @@ def frames_simulate(
 ) -> None:
     """Simulate a recording in the form that sensors write, with time stamps and the truth, to try match with.
 
-    The file says that it is simulated. A direct sensor with a [histogram] table reports what its chip does, in each
-    zone the nearest surface, and not a mean over the zone. It writes z in millimetres and status codes (5: valid),
-    another sensor ranges in metres with amplitudes. The truth of each frame stands in columns truth_..., which other
-    commands ignore.
+    The file states that it is simulated. Of a direct sensor it has z in millimetres and status codes (5: valid), with a
+    [histogram] table the nearest surface of each zone as the chip reports it; of another sensor ranges in metres and
+    amplitudes. Columns truth_... have the truth of each frame; other commands ignore them.
 
     Parameters
     ----------

@@ -31,8 +31,8 @@ def sensor_fit_direct(
 ) -> None:
     """Fit a direct sensor to histograms of a plane at known distances and of known objects at known poses.
 
-    The plane tells bin widths, delays, response, pile-up and the crosstalk of a cover glass; objects tell where each
-    zone looks, in which order zones are logged, how large they are and how much light strays. Each log holds
+    The plane determines bin widths, delays, response, pile-up and the crosstalk of a cover glass; objects determine
+    where each zone looks, the order in which zones are logged, their size and the share of stray light. Each log holds
     `histogram`, a plane's `distance_m`, an object's `sensor2world`; an object's mesh holds the table that it stands on.
 
     Parameters

@@ -54,8 +54,9 @@ def match_frames(
     All frames of a file are averaged: the camera stands still. A file of shape (n, frames, rows, cols) has n positions.
     With --moving every frame is a position of its own. A CSV file may have a header that names its columns: t_ms or
     t_s, mm_0 ... (or range_0 ..., z_0 ...), status_0 ..., pitch_deg, roll_deg (the tilt of each frame); for a VL53L5CX
-    or VL53L8CX give --valid-status 5. With --on histograms or --on targets FRAMES is a log of a direct sensor (histograms in NPZ or lines of JSON, targets
-    in CSV with columns mm_ZONE_TARGET) or a frame set with histograms, whose views are positions.
+    or VL53L8CX give --valid-status 5. With --on histograms or --on targets FRAMES is a log of a direct sensor
+    (histograms in NPZ or lines of JSON, targets in CSV with columns mm_ZONE_TARGET) or a frame set with histograms,
+    whose views are positions.
 
     Parameters
     ----------

@@ -77,7 +77,7 @@ class Search:
         With refine: standard deviation of the bearing; 1.5, with --on reported 3, unless --free or --fix is given.
     on
         With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its chip makes
-        them), histograms or targets. Unless stated: reported where the sensor has a [histogram] table, or ranges, also
+        them), histograms or targets. Unless stated: ranges, or reported where the sensor has a [histogram] table, except
         with --unknown-background and --no-background.
     pixels
         With refine: pixels that are compared, all or the lower half of the rows.
@@ -91,11 +91,11 @@ class Search:
         With refine: other things may stand before, beside and behind it.
     no_background
         With refine: nothing returns beside it. Unless the background is stated, nothing, wall and floor, and unknown
-        things are tried in turn, up to what explains the frame.
+        things are tried in turn, until one explains the frame.
     floor_albedo
         With --floor and --bounces: albedo of the floor; estimated between 0.05 and 0.6 unless stated.
     same_recording
-        With refine: the sensor was calibrated on these frames; leave out by what another recording differs.
+        With refine: leave out the differences between recordings, for frames that calibrated the sensor.
     """
 
     filter_name: Literal["kalman", "phasor-mean"] = "kalman"

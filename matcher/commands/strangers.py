@@ -24,8 +24,8 @@ def bank_strangers(
 ) -> None:
     """Match frames of the bank's landmarks at other sizes or with a piece cut off, and count which are accepted.
 
-    What is accepted here in every second frame, the sensor cannot distinguish from the landmark: that part must not
-    stand where the robot looks for it.
+    The sensor cannot distinguish a part that is accepted in every second frame from the landmark: keep that part away
+    from where the robot looks.
 
     Parameters
     ----------
