@@ -77,8 +77,8 @@ class Search:
         With refine: standard deviation of the bearing; 1.5, with --on reported 3, unless --free or --fix is given.
     on
         With refine: ranges, or phasors with the albedo free; of a direct sensor also reported (ranges as its chip makes
-        them), histograms or targets. Unless stated: ranges, or reported where the sensor has a [histogram] table, except
-        with --unknown-background and --no-background.
+        them), histograms or targets. Unless stated: ranges, or reported where the sensor has a [histogram] table,
+        except with --unknown-background and --no-background.
     pixels
         With refine: pixels that are compared, all or the lower half of the rows.
     robust
