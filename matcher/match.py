@@ -94,7 +94,7 @@ class Match:
         Whether other things might stand before, beside and behind the landmark.
     systematic : mapping of str to ndarray
         What of `covariance` all frames of the camera share, by its cause: "calibration", "recording", "declared",
-        "motion". The rest is noise.
+        "multipath", "floor_albedo", "motion". The rest is noise.
     may_be_mirrored : bool or None
         Of an accepted answer of the method `refine`, whether the frame mirrored left to right may be a frame of the
         bank too: then nothing in it shows whether the image is mirrored, as reading it the wrong way leaves it, and δ

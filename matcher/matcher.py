@@ -108,8 +108,9 @@ class Matcher:
     systematic : collection of {"calibration", "recording", "declared", "multipath", "motion"}, optional
         Which errors that all frames of the camera share are added to the covariance of "refine": what the calibration
         of the frames' sensor leaves, what differs in another recording than those that calibrated it, what the sensor
-        declares of a pose, and what the jitter of its stamps makes of the camera's motion. None: all; of histograms and
-        targets the last two.
+        declares of a pose, light that bounces off a floor below the landmark where no background says how often it may
+        (`lamp_half_angle_deg` of the sensor is needed), and what the jitter of its stamps makes of the camera's motion.
+        None: all; of histograms and targets "declared" and "motion".
     tolerance_m, tolerance_rad : float
         How far off an accepted answer may be. An answer is refused as "undetermined" where the frame leaves a free
         length or angle open by more than this, and as "ambiguous" where another class, or a view farther away than

@@ -168,7 +168,8 @@ def check_behind(parameters: NDArray[np.float64], vertices: NDArray[np.float64],
     """Refuse what :meth:`Background.check_behind` refuses; each view has its own row of `parameters`, (n, 5)."""
     wall_m, floor_m = parameters[:, 0], parameters[:, 1]
     farthest, deepest = _extremes(wall_m, vertices, views)
-    above = (floor_m > 0) & (deepest > floor_m + 1e-9)
+    rounding_m = 1e-6  # files of meshes have single precision
+    above = (floor_m > 0) & (deepest > floor_m + rounding_m)
     if above.any():
         i = int(np.argmax(above))
         raise UsageError(

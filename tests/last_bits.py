@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render import renderer
-from phasemark.render.integral import scene_samples
+from phasemark.render.integral import area_integral, scene_samples
 from phasemark.render.integral.arguments import Poses
 
 
@@ -28,6 +28,6 @@ def poses_with_other_bits(*arguments: Any) -> Poses:
     return poses._replace(lens=flipped(poses.lens), matrix=flipped(poses.matrix), offset=flipped(poses.offset))
 
 
-_poses = renderer.poses_of_views
+_poses = area_integral.poses_of_views
 for module in (renderer, scene_samples):
     vars(module)["poses_of_views"] = poses_with_other_bits

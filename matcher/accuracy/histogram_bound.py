@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -73,7 +74,7 @@ def histogram_information(
         columns.append((sides[0] - sides[1]) / (2 * STEPS[name]))
     for plane in planes_of(background):
         assert background is not None
-        others = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
+        others: dict[str, Any] = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
         columns.append(renderer.signal(views, background=replace(background, **others), workers=workers)[:, 1])
     if free_wall:
         assert background is not None

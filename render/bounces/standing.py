@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -113,10 +113,11 @@ class Stand:
         _, self.group = np.unique(keys, axis=0, return_inverse=True)
         self.group = self.group.ravel()
         weights = patches.area
-        self.area = np.bincount(self.group, weights)
-        sums = lambda values: np.stack([np.bincount(self.group, weights * column) for column in values.T], axis=1)  # noqa: E731
-        self.centre = sums(patches.centre) / self.area[:, None]
-        self.normal = sums(patches.normal) / self.area[:, None]
+        self.area = np.asarray(np.bincount(self.group, weights), np.float64)
+        share = (weights / self.area[self.group])[:, None]
+        self.centre, self.normal = np.zeros((2, len(self.area), 3))
+        np.add.at(self.centre, self.group, share * patches.centre)
+        np.add.at(self.normal, self.group, share * patches.normal)
         first = np.full(len(self.area), -1)
         far = np.linalg.norm(patches.centre - self.centre[self.group], axis=1)
         order = np.argsort(-far)
@@ -495,7 +496,8 @@ def _meeting_points(mesh: MeshTopology, floor_z_m: float | None) -> NDArray[np.f
     extent = float(np.ptp(mesh.vertices, axis=0).max())
     if floor_z_m is not None and mesh.low[2] - floor_z_m < _NEARBY_M:
         height = max(float(mesh.low[2]), floor_z_m) + 1e-4 * extent
-        segments.append(trimesh.intersections.mesh_plane(whole, [0, 0, 1], [0, 0, height]).reshape(-1, 2, 3))
+        cut = trimesh.intersections.mesh_plane(whole, [0, 0, 1], [0, 0, height])  # type: ignore[no-untyped-call]
+        segments.append(np.asarray(cut, np.float64).reshape(-1, 2, 3))
     ends = np.concatenate(segments)
     count = np.ceil(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / (_FINEST_SHARE * extent)).astype(np.int64) + 1
     return np.concatenate([np.linspace(a, b, n) for (a, b), n in zip(ends, count, strict=True)] or [np.empty((0, 3))])
@@ -512,7 +514,7 @@ def _with_floor(mesh: MeshTopology, floor_z_m: float | None) -> MeshTopology:
         sheet = np.array([[0, 1, 2], [0, 2, 3]]) + len(vertices)
         vertices, faces = np.concatenate([vertices, corners]), np.concatenate([faces, sheet])
         part, albedo = np.concatenate([part, [_FLOOR, _FLOOR]]), np.concatenate([albedo, [1.0, 1.0]])
-    attributes = {"part": part.astype(np.int32), "albedo": albedo}
+    attributes: dict[str, Any] = {"part": part.astype(np.int32), "albedo": albedo}
     found = topology_of(trimesh.Trimesh(vertices, faces, process=False, face_attributes=attributes))
     return found._replace(closed=(found.part == _LANDMARK) & bool(mesh.closed.all()))
 

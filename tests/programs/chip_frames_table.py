@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -48,7 +49,7 @@ def bracket() -> trimesh.Trimesh:
 def scene(rng: np.random.Generator, mesh: trimesh.Trimesh) -> tuple[Views, Background | None]:
     """Return a random view of a part, and what stands behind it."""
     distance_m, radius_m = rng.uniform(0.4, 1.2), float(np.hypot(*mesh.vertices[:, :2].T).max())
-    planes = {}
+    planes: dict[str, Any] = {}
     if rng.random() < 0.8:
         planes["wall_m"] = distance_m + radius_m + rng.uniform(0.3, 2.0)
     if rng.random() < 0.5:

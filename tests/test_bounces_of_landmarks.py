@@ -1,0 +1,159 @@
+"""Light that bounces between a landmark and its background: the foreign path tracer's frames, rendered and matched."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+
+from phasemark import UsageError
+from phasemark.data import Bank, build_bank
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, capture, preset
+from phasemark.render.bounces import standing
+
+GOLDEN = Path(__file__).parent / "golden" / "multipath.npz"
+BEHIND = Background(wall_m=2.2, floor_m=0.15, wall_albedo=0.4, floor_albedo=0.5)
+"""Of the scene "box"; the box's albedo is 0.8."""
+N = 3
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[str, Any]:
+    """Return the arrays of the scene "box"."""
+    with np.load(GOLDEN) as file:
+        return {key.removeprefix("box/"): file[key] for key in file.files if key.startswith("box/")}
+
+
+@pytest.fixture(scope="module")
+def sensor(known: dict[str, Any]) -> Sensor:
+    about = json.loads(str(known["description"]))
+    return preset("pmd-16x16").with_(**about["camera"], lamp_half_angle_deg=about["lamp_half_angle_deg"])
+
+
+@pytest.fixture(scope="module")
+def mesh(known: dict[str, Any]) -> trimesh.Trimesh:
+    """Return the box as a landmark whose axis is 1 m before the lens."""
+    return trimesh.Trimesh(known["vertices_2"] - [1.0, 0.0, 0.0], known["faces_2"], process=False)
+
+
+@pytest.fixture(scope="module")
+def renderer(mesh: trimesh.Trimesh, sensor: Sensor) -> Renderer:
+    return Renderer(mesh, sensor, albedo=0.8)
+
+
+@pytest.mark.parametrize(("bounces", "key", "largest"), [(1, "bounces_1", 2e-3), ("all", "all", 3e-3)])
+def test_a_box_before_floor_and_wall_returns_the_light_of_a_foreign_path_tracer(
+    known: dict[str, Any], renderer: Renderer, bounces: Any, key: str, largest: float
+) -> None:
+    images = [renderer.render(1.0, background=replace(BEHIND, bounces=n)) for n in (0, bounces)]
+    error = np.abs(images[1].phasor[0] - images[0].phasor[0] - known[f"{key}_minus_direct_S"][0])
+    brightest = np.abs(known["direct_quadrature_S"][0]).max()
+    beyond = np.maximum(error - 4 * known[f"{key}_minus_direct_S_se"][0], 0) / brightest
+    assert np.quantile(beyond, 0.9) < 5e-4
+    assert beyond.max() < largest
+    assert (images[1].intensity >= images[0].intensity - 1e-9).all()
+
+
+def test_light_between_nodes_is_that_of_nodes_nearby(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+    behind, view = replace(BEHIND, bounces="all"), (1.04, 0.07)
+    direct = np.abs(renderer.render(*view, background=BEHIND).phasor)
+    coarse = renderer.render(*view, background=behind).phasor
+    assert renderer._standing is not None
+    monkeypatch.setattr(standing, "_STEP_SHARE", 0.01)
+    monkeypatch.setattr(standing, "_STEP_RAD", 2 * np.pi / 500)
+    renderer._standing._nodes.clear()
+    fine = renderer.render(*view, background=behind).phasor
+    renderer._standing._nodes.clear()
+    assert np.abs(coarse - fine).max() < 1e-3 * direct.max()
+    assert np.abs(coarse).max() > 1.01 * direct.max()
+
+
+def test_what_bounces_is_a_polynomial_in_the_floors_albedo(renderer: Renderer) -> None:
+    found = [
+        renderer.render(1.0, background=replace(BEHIND, floor_albedo=albedo, bounces="all")).intensity[0, 11, 8]
+        - renderer.render(1.0, background=replace(BEHIND, floor_albedo=albedo)).intensity[0, 11, 8]
+        for albedo in (0.0, 0.2, 0.4, 0.6)
+    ]
+    assert found[0] < 0.2 * found[2]  # most of what reaches the box has met the floor
+    third = found[3] - 3 * found[2] + 3 * found[1] - found[0]
+    assert abs(third) < 0.02 * found[3]
+
+
+def _frames(known: dict[str, Any], like: PhasorImages) -> PhasorImages:
+    """Return the foreign image of all bounces."""
+    phasor = known["direct_quadrature_S"][0] + known["all_minus_direct_S"][0]
+    gain = np.abs(phasor) / np.abs(known["direct_quadrature_S"][0])
+    return replace(like, phasor=phasor[None].astype(np.complex128), intensity=like.intensity * gain)
+
+
+@pytest.fixture(scope="module")
+def bank(mesh: trimesh.Trimesh, sensor: Sensor, tmp_path_factory: pytest.TempPathFactory) -> Bank:
+    folder = tmp_path_factory.mktemp("box")
+    mesh.export(folder / "box.stl")
+    overrides = {
+        name: getattr(sensor, name) for name in ("lamp_half_angle_deg", "half_angle_h_deg", "half_angle_v_deg")
+    }
+    plan = {
+        "classes": [],
+        "meshes": [{"name": "box", "unit": "m", "path": str(folder / "box.stl"), "albedo": 0.8}],
+        "layout": "full",
+        "distance_m": "0.9:1.1:0.01",
+        "delta_deg": "-20:20:1",
+        "sensor_overrides": overrides,
+    }
+    return build_bank(plan, folder / "bank.h5")
+
+
+def _matched(bank: Bank, image: PhasorImages, background: Any) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return which of some frames are accepted, and error of D and its standard deviation, (N, 2) m."""
+    matcher = Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=background)
+    accepted, errors = [], []
+    for seed in range(N):
+        frames = capture(image, bank.sensor, n_frames=50, rng=np.random.default_rng(seed))
+        answer = matcher.match(kalman_filter(frames))[0]
+        accepted.append(answer.accepted)
+        std = np.nan if answer.covariance is None else float(np.sqrt(answer.covariance[0, 0]))
+        errors.append((answer.distance_m - 1.0, std))
+    return np.array(accepted), np.array(errors)
+
+
+def test_foreign_frames_are_matched_where_light_bounces_off_a_floor_of_unknown_albedo(
+    known: dict[str, Any], renderer: Renderer, bank: Bank
+) -> None:
+    image = _frames(known, renderer.render(1.0, background=BEHIND))
+    unknown_floor = replace(BEHIND, floor_albedo=0.33, floor_albedo_std=0.16, bounces="all")
+    accepted, errors = _matched(bank, image, unknown_floor)
+    assert accepted.all()
+    assert abs(errors[:, 0].mean()) < 3e-4
+    assert np.median((errors[:, 0] / errors[:, 1]) ** 2) < 3.0
+    direct, _ = _matched(bank, image, BEHIND)
+    assert not direct.any()  # without bounces the frames are refused
+
+
+def test_light_that_bounces_unmodelled_is_in_the_covariance(
+    known: dict[str, Any], renderer: Renderer, bank: Bank
+) -> None:
+    image = _frames(known, renderer.render(1.0, background=BEHIND))
+    accepted, errors = _matched(bank, image, "unknown")
+    held = np.abs(errors[:, 0]) < 2.5 * errors[:, 1]
+    assert (held | ~accepted).all()
+    assert np.abs(errors[accepted, 0]).min(initial=1.0) > 1e-3  # as far off as the covariance says
+
+
+def test_bounces_that_no_renderer_computes_are_refused(mesh: trimesh.Trimesh, sensor: Sensor) -> None:
+    with pytest.raises(UsageError, match="'bounces' must be 0, 1, 2, … or 'all', got 'many'"):
+        replace(BEHIND, bounces="many")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="'floor_albedo_std' must be 0 or more, got -1"):
+        replace(BEHIND, floor_albedo_std=-1)
+    behind = replace(BEHIND, bounces="all")
+    with pytest.raises(UsageError, match="needs the sensor's 'lamp_half_angle_deg'"):
+        Renderer(mesh, sensor.with_(lamp_half_angle_deg=None)).render(1.0, background=behind)
+    with pytest.raises(UsageError, match="without one, put wall and floor into a Scene"):
+        Renderer(None, sensor).render(1.0, background=behind)
