@@ -26,6 +26,7 @@ from phasemark.matcher.commands import (
     demo,
     design,
     drive,
+    locate,
     match,
     plan,
     pose,
@@ -116,8 +117,8 @@ def _add_commands(group: str, purpose: str, *functions: Callable[..., None]) -> 
 
 _add_commands(
     "", "",
-    render.render_frame, match.match_frames, calibrate.calibrate_camera, accuracy.accuracy_line, demo.demo_report,
-    drive.drive_robot, warm.warm_kernels,
+    render.render_frame, match.match_frames, calibrate.calibrate_camera, locate.locate_rig, accuracy.accuracy_line,
+    demo.demo_report, drive.drive_robot, warm.warm_kernels,
 )  # fmt: skip
 _add_commands(
     "landmark", "The landmarks: the catalogue and mesh files.",

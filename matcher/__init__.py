@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from phasemark.matcher.filters.kalman_filters import PixelKalman, kalman_filter
     from phasemark.matcher.filters.mean_phasor import phasor_mean
     from phasemark.matcher.likelihood.search_policy import SearchPolicy
+    from phasemark.matcher.locate.locator import Locator
     from phasemark.matcher.match import Match, Matches
     from phasemark.matcher.matcher import Matcher
     from phasemark.matcher.position.robot_pose import RobotPose, robot_poses
@@ -21,6 +22,7 @@ else:
 
 __all__ = [
     "FilteredFrames",
+    "Locator",
     "Match",
     "Matcher",
     "Matches",

@@ -1,0 +1,146 @@
+"""The command ``phasemark locate``: where a robot with several sensors stands in a map."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from phasemark import UsageError
+from phasemark.data.commands.command import Shown
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
+from phasemark.data.commands.options import Count, Degrees, Force, Json, Metres, Out
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
+
+if TYPE_CHECKING:
+    from phasemark.matcher.locate.locator import LocatedPose, Locator
+    from phasemark.matcher.locate.recording import RigRecording
+    from phasemark.matcher.locate.rig import Rig
+
+
+def locate_rig(
+    map_file: Path,
+    rig_file: Path,
+    recordings: Annotated[list[Path], Shown(metavar="RECORDING...")],
+    *,
+    start: Annotated[Path | None, Shown(metavar="CSV")] = None,
+    odometry: bool = False,
+    start_std: Metres = 0.5,
+    start_yaw_std: Degrees = 15.0,
+    frames: Count | None = None,
+    smooth: bool = False,
+    map_name: Annotated[str | None, Shown("--map-name", metavar="NAME")] = None,
+    tolerance: Metres = 0.1,
+    tolerance_yaw: Degrees = 5.0,
+    out: Out,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Find where a robot with several range sensors stands among the walls of a map.
+
+    Without --start or --odometry the whole map is searched. Where several poses explain a stop it is refused as
+    ambiguous, and all of them are listed. The table has a line a stop: pose, covariance, accepted, reason, explained
+    share of the columns, alternatives.
+
+    Parameters
+    ----------
+    map_file
+        Walls, boxes, meshes and landmarks, .toml.
+    rig_file
+        The sensors and what is unknown of them, .toml.
+    recordings
+        Depths of columns or zones at the frames of stops, .npz.
+    start
+        Where the robot is believed to be: columns stop,x_m,y_m,yaw_deg[,robot,run].
+    odometry
+        Follow each robot from the first pose of its odometry, or its first in --start.
+    start_std
+        Standard deviation of the coordinates of starts.
+    start_yaw_std
+        Standard deviation of the headings of starts.
+    frames
+        Use that many frames of each stop.
+    smooth
+        Join the stops of each robot by its odometry.
+    map_name
+        Which map of a file with several; the recording names it otherwise.
+    tolerance
+        Three standard deviations of an accepted position, and how far another explanation may be off.
+    tolerance_yaw
+        The same of the heading.
+    out
+        The table, .csv.
+    """
+    from phasemark.matcher.locate.pose_table import pose_csv
+    from phasemark.matcher.locate.recording import read_rig_recording
+    from phasemark.matcher.locate.rig import read_rig
+
+    refuse_other_files(out, ".csv", "the table")
+    refuse_existing([out], force)
+    rig, answers, robot_key = read_rig(rig_file), [], "robot"
+    std = (start_std, start_std, math.radians(start_yaw_std))
+    with LongWork("locating"):
+        for path in recordings:
+            recording = read_rig_recording(path, rig)
+            recording = recording if frames is None else recording.first_frames(frames)
+            locator = _locator(map_file, map_name, rig, recording, (tolerance, math.radians(tolerance_yaw)))
+            answers += _located(locator, recording, start, odometry, std, smooth)
+            robot_key = recording.robot_key
+    write_file(out, pose_csv(answers, robot_key), force)
+    if as_json:
+        echo_json({"file": str(out), "poses": [one.as_dict() for one in answers]})
+        return
+    _echo_summary(answers)
+    echo(out)
+
+
+def _locator(
+    map_file: Path, map_name: str | None, rig: Rig, recording: RigRecording, tolerance: tuple[float, float]
+) -> Locator:
+    """Return the locator of a recording's map."""
+    from phasemark.matcher.locate.locator import Locator
+    from phasemark.matcher.locate.wall_map import read_wall_map
+
+    wall_map = read_wall_map(map_file, map_name or recording.map_name)
+    return Locator(wall_map, rig, tolerance_m=tolerance[0], tolerance_rad=tolerance[1])
+
+
+def _located(
+    locator: Locator,
+    recording: RigRecording,
+    start: Path | None,
+    odometry: bool,
+    std: tuple[float, float, float],
+    smooth: bool,
+) -> list[LocatedPose]:
+    """Locate the stops of a recording from what is known beforehand."""
+    from phasemark.matcher.locate.recording import poses_of, read_stop_poses
+    from phasemark.matcher.locate.smoothing import smoothed
+
+    starts = None if start is None else poses_of(recording, read_stop_poses(start))
+    if odometry:
+        first = {}
+        if starts is not None:
+            first = {int(robot): pose for robot, pose in zip(recording.robot[::-1], starts[::-1], strict=True)}
+            if any(math.isnan(pose[0]) for pose in first.values()):
+                raise UsageError(f"{start}: must have the first pose of each robot of '{recording.run}'")
+        answers = locator.follow(recording, first, std)
+    else:
+        answers = locator.locate(recording, starts, std)
+    return smoothed(recording, answers, locator.wall_map.part) if smooth else answers
+
+
+def _echo_summary(answers: Sequence[LocatedPose]) -> None:
+    """Print how many stops of each recording were accepted, and why others were not."""
+    rows = []
+    for run in dict.fromkeys(one.key[0] for one in answers):
+        own = [one for one in answers if one.key[0] == run]
+        refused = Counter(one.reason for one in own if not one.accepted)
+        reasons = ", ".join(f"{count} {reason}" for reason, count in refused.most_common())
+        rows.append((run, str(len(own)), str(sum(one.accepted for one in own)), reasons))
+    echo_table(("recording", "stops", "accepted", "refused"), rows)
+    echo(*(f"note: {one.key[0]} stop {one.key[1]}: {one.note}" for one in answers if one.note))

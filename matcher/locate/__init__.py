@@ -1,0 +1,28 @@
+"""A robot among walls: rigs of several sensors, maps, and the poses that explain a recording."""
+
+from typing import TYPE_CHECKING
+
+from phasemark.inputs import on_use
+
+if TYPE_CHECKING:
+    from phasemark.matcher.locate.locator import LocatedPose, Locator, OdometryDrift, PoseCandidate
+    from phasemark.matcher.locate.recording import RigRecording, read_rig_recording
+    from phasemark.matcher.locate.rig import Rig, RigSensor, read_rig
+    from phasemark.matcher.locate.wall_map import Wall, WallMap, read_wall_map
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
+
+__all__ = [
+    "LocatedPose",
+    "Locator",
+    "OdometryDrift",
+    "PoseCandidate",
+    "Rig",
+    "RigRecording",
+    "RigSensor",
+    "Wall",
+    "WallMap",
+    "read_rig",
+    "read_rig_recording",
+    "read_wall_map",
+]

@@ -1,0 +1,391 @@
+"""Localisation among known walls: all poses that explain a stop, and the rules by which one of them is accepted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from phasemark import UsageError
+from phasemark.matcher.estimate.acceptance import TOLERATED_SIGMA
+from phasemark.matcher.locate.kernel_arguments import Scan
+from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
+from phasemark.matcher.locate.recording import RigRecording
+from phasemark.matcher.locate.rig import Rig
+from phasemark.matcher.locate.scan_fit import StopFit, StopModel, fit_stop
+from phasemark.matcher.locate.wall_map import WallMap
+from phasemark.matcher.pixel_agreement import DISAGREEMENT
+
+_Float = NDArray[np.float64]
+
+LocateReason = Literal["", "no zones", "odometry jumps", "poor fit", "undetermined", "ambiguous"]
+_SAME_FRAMES = 3.0
+"""Frames of a stop that count as one opinion: what the map has wrong is wrong in all of them."""
+_MOST_STARTS, _MOST_REFINED = 32, 12
+_HOPELESS = 4 * DISAGREEMENT
+"""Cost by which a start may exceed the best one after a descent on three frames."""
+_REACH_SIGMA = 3.5
+"""Half the width of the region that is searched around a prior, in its standard deviations."""
+
+
+class PoseCandidate(NamedTuple):
+    """A pose that explains a stop: x, y (m), yaw (rad), how much more it costs than the best, and its share."""
+
+    x_m: float
+    y_m: float
+    yaw_rad: float
+    cost: float
+    weight: float
+    explained: float
+
+
+@dataclass(frozen=True, eq=False)
+class LocatedPose:
+    """Answer for one stop.
+
+    Parameters
+    ----------
+    key : (run, stop, robot)
+    x_m, y_m, yaw_rad : float
+        The best pose at the first frame; NaN where there is none.
+    covariance : (3, 3) float64
+        Of x, y (m), yaw (rad): noise, the unknowns of the stop, the prior, and the part of the map; NaN without a pose.
+    explained : float
+        Share of the observed columns that the pose explains.
+    observed : int
+        Columns that were observed.
+    accepted : bool
+    reason : str
+        Why it is refused: no zones, odometry jumps, poor fit, undetermined, or ambiguous. Empty if it is accepted.
+    alternatives : tuple of PoseCandidate
+        All poses that explain the stop nearly as well, best first, the answer itself among them.
+    note : str
+        What is wrong with the recording there.
+    """
+
+    key: tuple[str, int, int]
+    x_m: float = math.nan
+    y_m: float = math.nan
+    yaw_rad: float = math.nan
+    covariance: _Float = field(default_factory=lambda: np.full((3, 3), np.nan))
+    explained: float = 0.0
+    observed: int = 0
+    accepted: bool = False
+    reason: LocateReason = "no zones"
+    alternatives: tuple[PoseCandidate, ...] = ()
+    note: str = ""
+
+    @property
+    def pose(self) -> _Float:
+        """x, y, yaw, (3,)."""
+        return np.array([self.x_m, self.y_m, self.yaw_rad])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain numbers, for JSON: metres and degrees, in the covariance too."""
+        unit = np.array([1.0, 1.0, math.degrees(1.0)])
+        known = math.isfinite(self.x_m)
+        return {
+            "run": self.key[0],
+            "stop": self.key[1],
+            "robot": self.key[2],
+            "x_m": self.x_m if known else None,
+            "y_m": self.y_m if known else None,
+            "yaw_deg": math.degrees(self.yaw_rad) if known else None,
+            "covariance": (self.covariance * np.outer(unit, unit)).tolist() if known else None,
+            "explained": self.explained,
+            "observed": self.observed,
+            "accepted": self.accepted,
+            "reason": self.reason,
+            "note": self.note,
+            "alternatives": [
+                {**one._asdict(), "yaw_rad": None, "yaw_deg": math.degrees(one.yaw_rad)} for one in self.alternatives
+            ],
+        }
+
+
+class Locator:
+    """Localisation of a rig in a map.
+
+    Parameters
+    ----------
+    wall_map : WallMap
+    rig : Rig
+    tolerance_m, tolerance_rad : float
+        How far off an accepted pose may be: three standard deviations must be within it, and no other pose that
+        explains the stop may be farther away.
+    least_explained : float
+        Share of the observed columns that an accepted pose must explain.
+
+    Raises
+    ------
+    UsageError
+        A tolerance that is not positive, a share outside (0, 1).
+
+    Examples
+    --------
+    >>> room = WallMap(walls_m=[[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0]])
+    >>> Locator(room, Rig(sensor=[{"name": "front"}])).tolerance_m
+    0.1
+    """
+
+    def __init__(
+        self,
+        wall_map: WallMap,
+        rig: Rig,
+        *,
+        tolerance_m: float = 0.1,
+        tolerance_rad: float = math.radians(5.0),
+        least_explained: float = 0.7,
+    ) -> None:
+        for name, value in (("tolerance_m", tolerance_m), ("tolerance_rad", tolerance_rad)):
+            if not (math.isfinite(value) and value > 0):
+                raise UsageError(f"'{name}' must be positive, got {value!r}")
+        if not 0 < least_explained < 1:
+            raise UsageError(f"'least_explained' must be in (0, 1), got {least_explained!r}")
+        self.tolerance_m, self.tolerance_rad, self.least_explained = tolerance_m, tolerance_rad, least_explained
+        self.wall_map, self.rig = wall_map, rig
+        self.model = StopModel.of(rig, wall_map.outline())
+        self._grid = pose_grid(self.model.outline)
+
+    def locate(
+        self,
+        recording: RigRecording,
+        start: ArrayLike | None = None,
+        start_std: ArrayLike = (0.5, 0.5, 0.26),
+    ) -> list[LocatedPose]:
+        """Locate each stop of a recording.
+
+        Parameters
+        ----------
+        recording : RigRecording
+        start : (n, 3) array_like, optional
+            Where the robot is believed to be: x, y (m), yaw (rad). Stops with NaN, and all without `start`, are
+            searched for in the whole map.
+        start_std : (3,) or (n, 3) array_like
+            Standard deviations of `start`, which is a prior.
+
+        Returns
+        -------
+        list of LocatedPose
+
+        Raises
+        ------
+        UsageError
+            Starts of a wrong shape, or standard deviations that are not positive.
+        """
+        n = len(recording)
+        starts = np.full((n, 3), np.nan) if start is None else np.asarray(start, np.float64)
+        if starts.shape != (n, 3):
+            raise UsageError(f"'start' must be {(n, 3)}, one pose a stop, got {starts.shape}")
+        std = np.broadcast_to(np.asarray(start_std, np.float64), (n, 3))
+        if not (np.isfinite(std).all() and (std > 0).all()):
+            raise UsageError("'start_std' must be positive")
+        return [
+            self._located(recording, k, (starts[k], np.diag(std[k] ** 2)) if np.isfinite(starts[k]).all() else None)
+            for k in range(n)
+        ]
+
+    def follow(
+        self,
+        recording: RigRecording,
+        start: Mapping[int, ArrayLike] | None = None,
+        start_std: ArrayLike = (0.2, 0.2, 0.09),
+        drift: OdometryDrift | None = None,
+    ) -> list[LocatedPose]:
+        """Locate the stops of each robot one after the other, each from the last accepted pose and the odometry.
+
+        Parameters
+        ----------
+        recording : RigRecording
+            With odometry at its stops.
+        start : mapping of int to (3,) array_like, optional
+            First pose of each robot; that of the odometry where it is left out.
+        start_std : (3,) array_like
+        drift : OdometryDrift, optional
+
+        Returns
+        -------
+        list of LocatedPose
+            In the order of the recording. A stop that is refused is searched for in the whole map, too.
+
+        Raises
+        ------
+        UsageError
+            The recording has no odometry.
+        """
+        if recording.odometry is None:
+            raise UsageError(
+                "the recording must have odometry at its stops: odometry_x_m, odometry_y_m, odometry_yaw_rad"
+            )
+        drift = drift or OdometryDrift()
+        first = np.diag(np.square(np.asarray(start_std, np.float64)))
+        answers: dict[int, LocatedPose] = {}
+        for robot in np.unique(recording.robot):
+            own = np.flatnonzero(recording.robot == robot)
+            mean = np.asarray((start or {}).get(int(robot), recording.odometry[own[0]]), np.float64)
+            covariance = first
+            for k, before in zip(own, [None, *own[:-1]], strict=True):
+                if before is not None:
+                    step = relative_pose(recording.odometry[before], recording.odometry[k])
+                    mean, covariance = drift.moved(mean, covariance, step)
+                answer = self._located(recording, int(k), (mean, covariance))
+                if not answer.accepted and answer.reason in ("poor fit", "ambiguous"):
+                    anywhere = self._located(recording, int(k), None)
+                    answer = anywhere if anywhere.accepted else answer
+                if answer.accepted:
+                    mean, covariance = answer.pose, answer.covariance
+                answers[int(k)] = answer
+        return [answers[k] for k in range(len(recording))]
+
+    def _located(self, recording: RigRecording, k: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
+        """Locate one stop; `prior`: mean and covariance."""
+        answer = self.locate_scan(recording.scan(k), prior)
+        note = recording.notes[k] if recording.notes else ""
+        if "odometry jumps" in note:
+            answer = replace(answer, accepted=False, reason="odometry jumps")
+        return replace(answer, key=recording.key(k), note=note)
+
+    def locate_scan(self, scan: Scan, prior: tuple[_Float, _Float] | None = None) -> LocatedPose:
+        """Locate one stop.
+
+        Parameters
+        ----------
+        scan : Scan
+        prior : (mean, covariance), optional
+            (3,) and (3, 3). None: the whole map is searched.
+
+        Returns
+        -------
+        LocatedPose
+        """
+        used = np.isfinite(scan.depth_m).any(axis=(1, 2))
+        scan = Scan(scan.time_s[used], scan.depth_m[used], scan.odometry_time_s, scan.odometry)
+        observed = int(np.isfinite(scan.depth_m).sum())
+        if not observed:
+            return LocatedPose(("", 0, 0))
+        fits = self._fits(scan, prior)
+        if not fits:
+            return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
+        return self._answer(fits, len(scan.time_s))
+
+    def _fits(self, scan: Scan, prior: tuple[_Float, _Float] | None) -> list[StopFit]:
+        """Return distinct fits, best first: descents on three frames from a grid, then on all frames."""
+        few = np.unique(np.linspace(0, len(scan.time_s) - 1, 3).astype(int))
+        thin = Scan(scan.time_s[few], scan.depth_m[few], scan.odometry_time_s, scan.odometry)
+        around, given = None, None
+        if prior is not None:
+            mean, covariance = prior
+            around = (mean, _REACH_SIGMA * np.sqrt(np.diag(covariance)))
+            given = (mean, np.asarray(np.linalg.inv(covariance), np.float64))
+        starts = promising_poses(self._grid, self.model.numbers, thin, _MOST_STARTS, around)
+        if prior is not None:
+            starts = np.vstack([prior[0], starts])
+        fits = self._distinct([fit_stop(self.model, thin, pose, given) for pose in starts])
+        fits = [fit for fit in fits if fit.cost < fits[0].cost + _HOPELESS][:_MOST_REFINED]
+        if len(scan.time_s) > len(few):
+            fits = self._distinct([fit_stop(self.model, scan, fit.theta, given, (2.0, 1.0)) for fit in fits])
+        return fits
+
+    def _distinct(self, fits: list[StopFit]) -> list[StopFit]:
+        """Return fits that are within the map, best first, one of those that have nearly the same pose."""
+        low_x, low_y, high_x, high_y = self.model.outline.bounds_m
+        kept: list[StopFit] = []
+        for fit in sorted(fits, key=lambda one: one.cost):
+            x, y, _ = fit.pose
+            if not (low_x <= x <= high_x and low_y <= y <= high_y):
+                continue
+            if not any((apart(fit.pose, other.pose) < 0.2 * self._tolerance).all() for other in kept):
+                kept.append(fit)
+        return kept
+
+    @property
+    def _tolerance(self) -> _Float:
+        return np.array([self.tolerance_m, self.tolerance_m, self.tolerance_rad])
+
+    def _answer(self, fits: list[StopFit], frames: int) -> LocatedPose:
+        """Return the best fit as the answer, or the reason to refuse it, with what explains the stop nearly as well."""
+        best = fits[0]
+        opinions = max(1.0, frames / _SAME_FRAMES)
+        excess = np.array([fit.cost - best.cost for fit in fits]) / opinions
+        near = [k for k in range(len(fits)) if excess[k] < DISAGREEMENT and fits[k].share >= self.least_explained]
+        weight = np.exp(-0.5 * excess)
+        weight /= weight.sum()
+        candidates = []
+        for k in near:
+            x, y, yaw = fits[k].pose.tolist()
+            candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
+        covariance = best.covariance[:3, :3] + self.wall_map.part
+        x, y, yaw = best.pose.tolist()
+        reason = self._reason(fits, near, covariance)
+        return LocatedPose(
+            ("", 0, 0),
+            x,
+            y,
+            yaw,
+            covariance=covariance,
+            explained=best.share,
+            observed=best.observed,
+            accepted=not reason,
+            reason=reason,
+            alternatives=tuple(candidates),
+        )
+
+    def _reason(self, fits: list[StopFit], near: list[int], covariance: _Float) -> LocateReason:
+        """Return why the best fit is refused; empty where it is accepted."""
+        if fits[0].share < self.least_explained:
+            return "poor fit"
+        std = np.sqrt(np.diag(covariance))
+        if not (TOLERATED_SIGMA * std <= self._tolerance).all():
+            return "undetermined"
+        others = (apart(fits[k].pose, fits[0].pose) for k in near[1:])
+        return "ambiguous" if any((off > self._tolerance).any() for off in others) else ""
+
+
+@dataclass(frozen=True)
+class OdometryDrift:
+    """Standard deviations of the steps of odometry.
+
+    Parameters
+    ----------
+    per_m : float
+        Metres of a metre.
+    position_m : float
+        Of each step.
+    yaw_rad : float
+        Of each step.
+    """
+
+    per_m: float = 0.1
+    position_m: float = 0.05
+    yaw_rad: float = math.radians(1.5)
+
+    def covariance(self, step: _Float) -> _Float:
+        """Return the covariance of a step, (3, 3)."""
+        position = math.hypot(self.position_m, self.per_m * math.hypot(step[0], step[1]))
+        return np.diag(np.square([position, position, self.yaw_rad]))
+
+    def moved(self, mean: _Float, covariance: _Float, step: _Float) -> tuple[_Float, _Float]:
+        """Return mean and covariance of a pose after a step in the body's frame."""
+        cos, sin = math.cos(mean[2]), math.sin(mean[2])
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        by = turn @ step
+        slope = np.array([[1.0, 0.0, -by[1]], [0.0, 1.0, by[0]], [0.0, 0.0, 1.0]])
+        return mean + by, slope @ covariance @ slope.T + turn @ self.covariance(step) @ turn.T
+
+
+def relative_pose(before: _Float, after: _Float) -> _Float:
+    """Return a pose in the frame of another one, (3,)."""
+    cos, sin = math.cos(before[2]), math.sin(before[2])
+    x, y = after[:2] - before[:2]
+    return np.array([cos * x + sin * y, cos * y - sin * x, math.remainder(after[2] - before[2], math.tau)])
+
+
+def apart(one: _Float, other: _Float) -> _Float:
+    """Return how far two poses are apart, (3,): m, m, rad."""
+    off = np.abs(one - other)
+    off[2] = abs(math.remainder(off[2], math.tau))
+    return off

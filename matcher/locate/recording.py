@@ -1,0 +1,316 @@
+"""Recordings of a rig: depths of columns at the frames of stops, and the odometry there; poses in tables."""
+
+from __future__ import annotations
+
+import io
+import os
+import warnings
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.measured.recording import opened_npz
+from phasemark.inputs import read_text, read_whole
+from phasemark.inputs.table_cells import cells_of, finite_number
+from phasemark.matcher.locate.kernel_arguments import Scan
+from phasemark.matcher.locate.rig import Rig
+
+_Float = NDArray[np.float64]
+
+_MOST_BYTES = 1 << 30
+_FASTEST_M_S, _FASTEST_RAD_S = 5.0, 12.0
+"""Odometry that moves faster between two frames has jumped."""
+_MOVED_M, _TURNED_RAD = 0.03, 0.05
+"""While a robot moves by more, no sensor returns the same depths at each frame."""
+_FEWEST_TO_STICK = 3
+"""Frames that must agree to the last digit before a sensor counts as stuck."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigRecording:
+    """Depths that the sensors of a rig measured at n stops of F frames, and the odometry.
+
+    Parameters
+    ----------
+    depth_m : (n, F, S, C) float64
+        Along the boresight, sensors in the order of the rig; NaN where there is none.
+    time_s : (n, F) float64
+        Since the first frame of the stop.
+    moved : (n, F, 3) float64
+        Odometry since the first frame, in the body's frame there: x, y (m), yaw (rad).
+    odometry : (n, 3) float64, optional
+        Pose of the odometry at the first frame, in a frame of its own.
+    stop, robot : (n,) int64
+    run : str
+        Name of the recording.
+    map_name : str, optional
+        Name of the map that it was taken in.
+    robot_key : str
+        Word for `robot` in the recording and in tables made from it.
+    notes : tuple of str
+        What each stop has wrong: sensors that are stuck, odometry that jumps; empty strings elsewhere.
+    """
+
+    depth_m: _Float
+    time_s: _Float
+    moved: _Float
+    odometry: _Float | None
+    stop: NDArray[np.int64]
+    robot: NDArray[np.int64]
+    run: str = ""
+    map_name: str | None = None
+    robot_key: str = "robot"
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.depth_m)
+
+    def scan(self, k: int, frames: Sequence[int] | None = None) -> Scan:
+        """Return the frames of a stop, or some of them."""
+        used = np.arange(self.depth_m.shape[1]) if frames is None else np.asarray(frames)
+        depth = np.ascontiguousarray(self.depth_m[k][used])
+        return Scan(self.time_s[k][used], depth, self.time_s[k].copy(), np.ascontiguousarray(self.moved[k]))
+
+    def first_frames(self, n: int) -> Self:
+        """Return the recording with the first n frames of each stop; the odometry stays."""
+        if not 1 <= n <= self.depth_m.shape[1]:
+            raise UsageError(f"'frames' must be 1 … {self.depth_m.shape[1]}, got {n}")
+        depth = self.depth_m.copy()
+        depth[:, n:] = np.nan
+        return replace(self, depth_m=depth)
+
+    def key(self, k: int) -> tuple[str, int, int]:
+        """Return run, stop and robot of a stop."""
+        return self.run, int(self.stop[k]), int(self.robot[k])
+
+
+def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
+    """Read a recording of a rig from an NPZ file.
+
+    Parameters
+    ----------
+    path : path-like
+        Arrays `z_m` or `range_m` (n, F, sensors, columns), or (n, F, sensors, rows, columns), NaN or status where
+        invalid; `sensor` (sensors,), names; `frame_time_s` (F,) or (n, F). Optional: `status` like the depths;
+        `sensor_read` (n, F, sensors); `odo_dx_m`, `odo_dy_m`, `odo_dyaw_rad` (n, F), odometry since the first frame in
+        the axes of the odometry; `odometry_x_m`, `odometry_y_m`, `odometry_yaw_rad` (n,), its pose there; `stop` and
+        `robot` or `drone` (n,); `run`, `map`. Without names of sensors they are in the order of the rig.
+    rig : Rig
+        Which sensors there are, which quantity, and how rows are reduced.
+
+    Returns
+    -------
+    RigRecording
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, an array is missing or of a wrong shape, times do not rise, or the recording lacks a
+        sensor of the rig.
+    """
+    path = Path(path)
+    arrays = _arrays(path)
+    name = next((name for name in ("z_m", "range_m") if name in arrays), None)
+    if name is None:
+        raise InputFileError(f"{path}: must have an array 'z_m' or 'range_m', got {', '.join(arrays) or 'nothing'}")
+    depth = _number_array(arrays[name], path, name)
+    if depth.ndim not in (4, 5):
+        raise InputFileError(f"{path}: '{name}' must be (stops, frames, sensors, [rows,] columns), got {depth.shape}")
+    n, frames = depth.shape[:2]
+    depth = _valid(depth, arrays, path, rig)
+    depth = _of_sensors(depth, arrays, path, rig)
+    depth = _as_depth(depth, "range" if name == "range_m" else rig.quantity, rig)
+    time_s = np.broadcast_to(_number_array(_needed(arrays, "frame_time_s", path), path, "frame_time_s"), (n, frames))
+    backwards = np.argwhere(np.diff(time_s, axis=1) <= 0)
+    if len(backwards):
+        k, f = backwards[0]
+        raise InputFileError(f"{path}: 'frame_time_s' must rise, got {time_s[k, f + 1]:g} s after {time_s[k, f]:g} s in"
+                             f" frame {f + 1} of stop {k}")  # fmt: skip
+    moved, odometry = _odometry(arrays, path, n, frames)
+    robot_key = "drone" if "drone" in arrays else "robot"
+    stop = np.asarray(arrays.get("stop", np.arange(n)), np.int64)
+    robot = np.asarray(arrays.get(robot_key, np.zeros(n)), np.int64)
+    if stop.shape != (n,) or robot.shape != (n,):
+        raise InputFileError(f"{path}: 'stop' and '{robot_key}' must have {n} numbers, one a stop")
+    run = str(arrays["run"]) if "run" in arrays else path.stem
+    recording = RigRecording(depth, np.ascontiguousarray(time_s - time_s[:, :1]), moved, odometry, stop, robot, run,
+                             str(arrays["map"]) if "map" in arrays else None, robot_key)  # fmt: skip
+    return _judged(recording, rig)
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an NPZ file."""
+    content = read_whole(path, most_bytes=_MOST_BYTES)
+    try:
+        with opened_npz(io.BytesIO(content), len(content), path) as archive:
+            return {name: np.asarray(archive[name]) for name in archive}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        if isinstance(error, PhasemarkError):
+            raise
+        raise InputFileError(f"{path}: not an NPZ file that can be read ({error})") from None
+
+
+def _needed(arrays: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
+    if name not in arrays:
+        raise InputFileError(f"{path}: must have an array '{name}', got {', '.join(arrays)}")
+    return arrays[name]
+
+
+def _number_array(array: NDArray[Any], path: Path, name: str) -> _Float:
+    try:
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InputFileError(f"{path}: '{name}' must be numbers, got {array.dtype}") from None
+
+
+def _valid(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
+    """Return depths with NaN where they are no measurement."""
+    good = np.isfinite(depth) & (depth > 0)
+    if "status" in arrays:
+        if arrays["status"].shape != depth.shape:
+            raise InputFileError(f"{path}: 'status' must be {depth.shape}, got {arrays['status'].shape}")
+        good &= np.isin(arrays["status"], rig.reduction.valid_status)
+    if "sensor_read" in arrays:
+        read = np.asarray(arrays["sensor_read"], bool)
+        if read.shape != depth.shape[:3]:
+            raise InputFileError(f"{path}: 'sensor_read' must be {depth.shape[:3]}, got {read.shape}")
+        good &= read.reshape(*read.shape, *(1,) * (depth.ndim - 3))
+    return np.where(good, depth, np.nan)
+
+
+def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
+    """Return the sensors of the rig in its order, rows reduced."""
+    count = depth.shape[2]
+    names = [str(name) for name in np.atleast_1d(arrays.get("sensor", rig.names))]
+    if len(names) != count:
+        raise InputFileError(f"{path}: has {count} sensors, but {len(names)} names of sensors")
+    for name in rig.names:
+        if name not in names:
+            raise InputFileError(f"{path}: no sensor '{name}' of the rig, got {', '.join(names)}")
+    depth = depth[:, :, [names.index(name) for name in rig.names]]
+    if depth.ndim == 5:
+        first, last = rig.reduction.rows or (0, depth.shape[3] - 1)
+        if not first <= last < depth.shape[3]:
+            raise InputFileError(f"{path}: 'reduction.rows' of the rig must be within its {depth.shape[3]} rows")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # a column without a valid row is NaN
+            reduce = np.nanmedian if rig.reduction.how == "median" else np.nanmean
+            depth = reduce(depth[:, :, :, first : last + 1], axis=3)
+    columns = rig.numbers().columns
+    if depth.shape[3] != columns.max():
+        raise InputFileError(f"{path}: has {depth.shape[3]} columns, but the sensors of the rig {columns.max()}")
+    return np.ascontiguousarray(depth, dtype=np.float64)
+
+
+def _as_depth(depth: _Float, quantity: str, rig: Rig) -> _Float:
+    """Return distances along the boresight."""
+    if quantity == "z":
+        return depth
+    numbers = rig.numbers()
+    azimuth = (0.5 * (numbers.columns[:, None] - 1) - np.arange(depth.shape[3])) * numbers.step_rad[:, None]
+    return np.asarray(depth * np.cos(azimuth))
+
+
+def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: int) -> tuple[_Float, _Float | None]:
+    """Return the motion within each stop in the body's frame, and the pose at its first frame."""
+    at_first = None
+    names = ("odometry_x_m", "odometry_y_m", "odometry_yaw_rad")
+    if names[0] in arrays:
+        at_first = np.column_stack([_number_array(_needed(arrays, name, path), path, name) for name in names])
+        if at_first.shape != (n, 3):
+            raise InputFileError(f"{path}: '{names[0]}' must have {n} numbers, one a stop")
+    within = ("odo_dx_m", "odo_dy_m", "odo_dyaw_rad")
+    if within[0] not in arrays:
+        return np.zeros((n, frames, 3)), at_first
+    world = np.stack([_number_array(_needed(arrays, name, path), path, name) for name in within], axis=-1)
+    if world.shape != (n, frames, 3):
+        raise InputFileError(f"{path}: '{within[0]}' must be {(n, frames)}, got {world.shape[:-1]}")
+    if at_first is None:
+        raise InputFileError(f"{path}: '{within[0]}' needs '{names[2]}', the yaw at the first frame")
+    if not (np.isfinite(world).all() and np.isfinite(at_first).all()):
+        raise InputFileError(f"{path}: the odometry must be finite numbers")
+    cos, sin = np.cos(at_first[:, 2, None]), np.sin(at_first[:, 2, None])
+    x, y = cos * world[..., 0] + sin * world[..., 1], cos * world[..., 1] - sin * world[..., 0]
+    return np.stack([x, y, world[..., 2]], axis=-1), at_first
+
+
+def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
+    """Leave out sensors that are stuck while the robot moves, and note them and odometry that jumps."""
+    depth, notes = recording.depth_m.copy(), []
+    for k in range(len(recording)):
+        moved = recording.moved[k]
+        found = []
+        is_moving = np.ptp(moved[:, :2], axis=0).max() > _MOVED_M or np.ptp(moved[:, 2]) > _TURNED_RAD
+        for s, name in enumerate(rig.names):
+            own = depth[k, :, s][np.isfinite(depth[k, :, s]).any(axis=1)]
+            if (
+                is_moving
+                and len(own) >= _FEWEST_TO_STICK
+                and np.array_equal(own, np.broadcast_to(own[0], own.shape), True)
+            ):
+                depth[k, :, s] = np.nan
+                found.append(f"{name} is stuck")
+        step = np.abs(np.diff(moved, axis=0)) / np.diff(recording.time_s[k])[:, None]
+        if (step[:, :2] > _FASTEST_M_S).any() or (step[:, 2] > _FASTEST_RAD_S).any():
+            found.append("odometry jumps")
+        notes.append(", ".join(found))
+    return replace(recording, depth_m=depth, notes=tuple(notes))
+
+
+def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], _Float]:
+    """Read poses of stops from a CSV file with a header.
+
+    Parameters
+    ----------
+    path : path-like
+        Columns `x_m`, `y_m`, `yaw_deg`, `stop`, and where there are several `robot` or `drone` and `run`. Rows with an
+        empty cell there, or `accepted` 0, are left out.
+
+    Returns
+    -------
+    dict of (run, stop, robot) to (3,) float64
+        x, y (m), yaw (rad); run is "" and robot 0 where the file does not say.
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read, a column is missing, or a value is no number; with file, line and column.
+    """
+    path = Path(path)
+    lines = [line for line in read_text(path, most_bytes=_MOST_BYTES).splitlines() if line.strip()]
+    header = [name.strip() for name in cells_of(lines[0], f"{path}, line 1")] if lines else []
+    for needed in ("stop", "x_m", "y_m", "yaw_deg"):
+        if needed not in header:
+            raise InputFileError(f"{path}: no column '{needed}', got {', '.join(header) or 'nothing'}")
+    found = {}
+    robot_key = "drone" if "drone" in header else "robot"
+    for number, line in enumerate(lines[1:], 2):
+        where = f"{path}, line {number}"
+        cells = cells_of(line, where)
+        if len(cells) != len(header):
+            raise InputFileError(f"{where}: {len(cells)} values, must have {len(header)}")
+        row = dict(zip(header, cells, strict=True))
+        x, y, yaw, stop = (
+            finite_number(row[name], where, name, empty_is_nan=True) for name in ("x_m", "y_m", "yaw_deg", "stop")
+        )
+        if np.isnan([x, y, yaw, stop]).any() or row.get("accepted", "1").strip().lower() in ("0", "false", "no"):
+            continue
+        robot = finite_number(row.get(robot_key, "0"), where, robot_key)
+        found[row.get("run", "").strip(), int(stop), int(robot)] = np.array([x, y, np.radians(yaw)])
+    return found
+
+
+def poses_of(recording: RigRecording, table: Mapping[tuple[str, int, int], _Float]) -> _Float:
+    """Return the pose of each stop of a recording in a table of poses, (n, 3); NaN where it has none."""
+    missing = np.full(3, np.nan)
+    found = []
+    for k in range(len(recording)):
+        run, stop, robot = recording.key(k)
+        found.append(table.get((run, stop, robot), table.get(("", stop, robot), missing)))
+    return np.array(found).reshape(-1, 3)

@@ -1,0 +1,239 @@
+"""Rig files: several sensors on one robot, how well each is known, and the unknowns that every stop has of its own."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from phasemark import UsageError
+from phasemark.data.plans.bank_plan import PlanModel, read_plan, sensor_in_folder, sensor_of
+from phasemark.matcher.locate.kernel_arguments import RigNumbers
+
+_Float = NDArray[np.float64]
+_Number = Annotated[float, Field(allow_inf_nan=False)]
+_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+_Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+
+
+class SensorStd(PlanModel):
+    """Standard deviations of what a rig file states of a sensor, before a calibration."""
+
+    yaw_deg: _Size = 2.0
+    position_m: _Size = 0.001
+    delay_s: _Size = 0.03
+    range_offset_m: _Size = 0.01
+    range_scale: _Size = 0.01
+    fov_deg: _Size = 2.4
+
+
+class RigSensor(PlanModel):
+    """One sensor of a rig.
+
+    Parameters
+    ----------
+    name : str
+        Name that the recording has for it.
+    preset : str
+        A preset or a sensor file: columns and field of view, unless stated here.
+    x_m, y_m, z_m : float
+        Place in the robot's frame: x forward, y left.
+    yaw_deg, pitch_deg : float
+        Direction of the boresight; a pitch lengthens the distance to a vertical wall by 1 / cos.
+    roll_deg : 0 or 180
+        A sensor upside down has its columns the other way round.
+    delay_s : float
+        Age of its data when the odometry of a frame is read.
+    range_offset_m, range_scale : float
+        A depth d is reported as scale · d + offset.
+    columns : int, optional
+    fov_deg : float, optional
+        Full horizontal field of view.
+    footprint_columns : float
+        Base of the triangle that a column sees, in columns.
+    std : SensorStd
+    """
+
+    name: Annotated[str, Field(min_length=1, max_length=100)]
+    preset: str = "vl53l5cx-8x8"
+    x_m: _Number = 0.0
+    y_m: _Number = 0.0
+    z_m: _Number = 0.0
+    yaw_deg: _Number = 0.0
+    pitch_deg: Annotated[float, Field(gt=-60, lt=60)] = 0.0
+    roll_deg: Literal[0, 180] = 0
+    delay_s: _Number = 0.0
+    range_offset_m: _Number = 0.0
+    range_scale: _Positive = 1.0
+    columns: Annotated[int, Field(ge=1, le=4096)] | None = None
+    fov_deg: Annotated[float, Field(gt=0, lt=120)] | None = None
+    footprint_columns: Annotated[float, Field(gt=0, le=10)] = 2.5
+    std: SensorStd = SensorStd()
+
+
+class Reduction(PlanModel):
+    """Rows of zones that one number of a column is made from: the first and the last, counted from 0 at the top."""
+
+    rows: tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]] | None = None
+    how: Literal["median", "mean"] = "median"
+    valid_status: tuple[int, ...] = (5, 9)
+
+
+class RangeNoise(PlanModel):
+    """Noise of a column: σ² = (floor_m + share · depth)² + (edge_share · spread of depth in its footprint)².
+
+    A share `outliers` of the columns sees something else, anywhere up to `max_range_m`.
+    """
+
+    floor_m: _Positive = 0.0045
+    share: _Size = 0.008
+    edge_share: _Size = 1.0
+    outliers: Annotated[float, Field(gt=0, lt=1)] = 0.05
+    max_range_m: _Positive = 4.0
+
+
+class StopUnknowns(PlanModel):
+    """Standard deviations of what differs from stop to stop and is eliminated.
+
+    Drift of the odometry while a stop is scanned, age of the data, and of each sensor an offset of its range and of its
+    yaw. A value of 0 leaves one out.
+    """
+
+    drift_m_s: _Size = 0.015
+    age_s: _Size = 0.004
+    offset_m: _Size = 0.005
+    yaw_deg: _Size = 0.3
+
+
+class Rig(PlanModel):
+    """Sensors of a robot.
+
+    Parameters
+    ----------
+    sensor : sequence of RigSensor
+    quantity : 'z' or 'range'
+        Whether the recording holds distances along the boresight or along the ray.
+    reduction : Reduction
+        For recordings with rows.
+    noise : RangeNoise
+    stop : StopUnknowns
+
+    Examples
+    --------
+    >>> Rig(sensor=[{"name": "front", "x_m": 0.02}]).numbers().columns
+    array([8])
+    """
+
+    sensor: Annotated[tuple[RigSensor, ...], Field(min_length=1, max_length=64)]
+    quantity: Literal["z", "range"] = "z"
+    reduction: Reduction = Reduction()
+    noise: RangeNoise = RangeNoise()
+    stop: StopUnknowns = StopUnknowns()
+
+    @model_validator(mode="after")
+    def _is_a_rig(self) -> Self:
+        names = self.names
+        for k, name in enumerate(names):
+            if name in names[:k]:
+                raise UsageError(f"'sensor.{k}.name' must be a name of its own, got {name!r} twice")
+        return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the sensors."""
+        return tuple(one.name for one in self.sensor)
+
+    def in_folder(self, folder: Path) -> Self:
+        """Return the rig of a file in a folder: names of sensor files are relative to it."""
+        sensors = (one.model_copy(update={"preset": sensor_in_folder(one.preset, folder)}) for one in self.sensor)
+        return self.model_copy(update={"sensor": tuple(sensors)})
+
+    def numbers(self) -> RigNumbers:
+        """Return the numbers of the sensors, presets applied.
+
+        Raises
+        ------
+        UsageError, InputFileError
+            A preset that is unknown, a sensor file that cannot be read.
+        """
+        rows = []
+        for one in self.sensor:
+            columns, fov = one.columns, one.fov_deg
+            if columns is None or fov is None:
+                base = sensor_of(one.preset, {})
+                columns = columns or base.cols
+                fov = fov or 2 * float(base.half_angle_h_deg)
+            step = math.radians(fov) / columns * (1 if one.roll_deg == 0 else -1)
+            scale = one.range_scale / math.cos(math.radians(one.pitch_deg))
+            rows.append((math.radians(one.yaw_deg), one.x_m, one.y_m, one.delay_s, one.range_offset_m, scale, step,
+                         columns, one.footprint_columns))  # fmt: skip
+        yaw, x, y, delay, offset, gain, steps, n, footprint = np.array(rows, dtype=np.float64).T.copy()
+        return RigNumbers(yaw, x, y, delay, offset, gain, steps, n.astype(np.int64), footprint)
+
+    def with_numbers(self, numbers: RigNumbers, std: Mapping[str, _Float]) -> Self:
+        """Return the rig with calibrated numbers and their standard deviations.
+
+        Parameters
+        ----------
+        numbers : RigNumbers
+        std : mapping of str to (S,) float64
+            By the names of :class:`SensorStd`, in its units.
+        """
+        sensors = []
+        for k, one in enumerate(self.sensor):
+            update: dict[str, Any] = {
+                "yaw_deg": math.degrees(numbers.yaw_rad[k]),
+                "x_m": float(numbers.x_m[k]),
+                "y_m": float(numbers.y_m[k]),
+                "delay_s": float(numbers.delay_s[k]),
+                "range_offset_m": float(numbers.offset_m[k]),
+                "range_scale": float(numbers.scale[k]) * math.cos(math.radians(one.pitch_deg)),
+                "fov_deg": math.degrees(abs(numbers.step_rad[k])) * int(numbers.columns[k]),
+                "columns": int(numbers.columns[k]),
+                "std": one.std.model_copy(update={name: float(value[k]) for name, value in std.items()}),
+            }
+            sensors.append(one.model_copy(update=update))
+        return self.model_copy(update={"sensor": tuple(sensors)})
+
+    def to_toml(self) -> str:
+        """Return the rig as the text of a file."""
+        import tomlkit
+
+        document = tomlkit.document()
+        content = self.model_dump(mode="json", exclude_none=True)
+        sensors = content.pop("sensor")
+        for key, value in content.items():
+            document.add(key, tomlkit.item(value))
+        tables = tomlkit.aot()
+        for sensor in sensors:
+            tables.append(tomlkit.item({key: round(v, 7) if isinstance(v, float) else v for key, v in sensor.items()}))
+        document.add("sensor", tables)
+        return tomlkit.dumps(document)
+
+
+def read_rig(path: str | os.PathLike[str]) -> Rig:
+    """Read a rig from a TOML file.
+
+    Parameters
+    ----------
+    path : path-like
+        The file.
+
+    Returns
+    -------
+    Rig
+
+    Raises
+    ------
+    InputFileError
+        The file cannot be read or is not TOML.
+    UsageError
+        With one line that names the file, the key, the value and what would be right.
+    """
+    return read_plan(path, Rig)

@@ -1,0 +1,212 @@
+"""Fits of one stop: descents of the engine from starts to the poses that explain it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.estimate.solver import descend
+from phasemark.matcher.locate.kernel_arguments import Outline, Prediction, RigNumbers, Scan
+from phasemark.matcher.locate.rig import Rig
+from phasemark.matcher.locate.scan_rows import N_BODY, empty_prediction, predict, sums
+
+_Float = NDArray[np.float64]
+
+_WIDTHS = (8.0, 3.0, 1.0)
+"""Noise of the rounds of a descent, in that of the rig: a start may be off by more than a wall's noise."""
+_MOST_STEPS, _MOST_ROUNDS = 12, 8
+_DONE = 1e-3
+"""A step that lowers the cost by less than this ends a round, and a round that moves by less ends the descent."""
+_EVEN_LESS = 1e-9
+"""Standard deviation that stands for an unknown that is left out, in its unit."""
+
+
+@dataclass(frozen=True, eq=False)
+class StopModel:
+    """A rig in a map, ready to explain stops.
+
+    Parameters
+    ----------
+    rig : Rig
+    outline : Outline
+    numbers : RigNumbers, optional
+        Those of the rig if left out.
+    """
+
+    rig: Rig
+    outline: Outline
+    numbers: RigNumbers
+
+    @classmethod
+    def of(cls, rig: Rig, outline: Outline, numbers: RigNumbers | None = None) -> StopModel:
+        """Take a rig, with its own numbers if no others are given."""
+        return cls(rig, outline, rig.numbers() if numbers is None else numbers)
+
+    @property
+    def longest(self) -> _Float:
+        """Longest steps of the unknowns of a stop, (6 + 2 S,)."""
+        sensors = len(self.rig.sensor)
+        return np.array([0.15, 0.15, 0.15, 0.05, 0.05, 0.03] + [0.03] * sensors + [0.02] * sensors)
+
+    @property
+    def unknowns_std(self) -> _Float:
+        """Standard deviations of the unknowns of a stop beyond its pose, (3 + 2 S,)."""
+        stop, sensors = self.rig.stop, len(self.rig.sensor)
+        std = [stop.drift_m_s, stop.drift_m_s, stop.age_s]
+        std += [stop.offset_m] * sensors + [math.radians(stop.yaw_deg)] * sensors
+        return np.maximum(std, _EVEN_LESS)
+
+    @property
+    def outlier_density(self) -> float:
+        """ε / ((1 − ε) R), per metre."""
+        noise = self.rig.noise
+        return noise.outliers / ((1 - noise.outliers) * noise.max_range_m)
+
+    def prediction(self, theta: _Float, scan: Scan, walls: bool = False) -> Prediction:
+        """Return the depths that a stop should show; `walls`: with slopes by the displacements of walls."""
+        seen = empty_prediction(scan, len(self.outline.normal) if walls else 0)
+        predict(theta, scan, self.numbers, self.outline, seen)
+        return seen
+
+    def sigma_m(self, seen: Prediction) -> _Float:
+        """Return the noise of each column, (F, S, C); where no wall is seen, that of the farthest one."""
+        noise = self.rig.noise
+        depth = np.where(np.isnan(seen.depth_m), noise.max_range_m, seen.depth_m)
+        return np.hypot(noise.floor_m + noise.share * depth, noise.edge_share * seen.spread_m)
+
+
+@dataclass(frozen=True, eq=False)
+class StopFit:
+    """A pose that may explain a stop.
+
+    Parameters
+    ----------
+    theta : (6 + 2 S,) float64
+    covariance : (6 + 2 S, 6 + 2 S) float64
+        Of all unknowns of the stop, from evidence and priors.
+    cost : float
+        Twice the negative logarithm of the likelihood, priors included, but for a constant of the stop.
+    explained, observed : int
+        Columns.
+    """
+
+    theta: _Float
+    covariance: _Float
+    cost: float
+    explained: int
+    observed: int
+
+    @property
+    def pose(self) -> _Float:
+        """x, y, yaw."""
+        return self.theta[:3]
+
+    @property
+    def share(self) -> float:
+        """Explained share of the columns that were observed."""
+        return self.explained / max(self.observed, 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """A place of a descent, with the noise of the round."""
+
+    model: StopModel
+    scan: Scan
+    theta: _Float
+    mean: _Float
+    precision: _Float
+    sigma_m: _Float
+    cost: float
+    information: _Float
+    gradient: _Float
+    explained: int
+
+    @classmethod
+    def at(
+        cls,
+        model: StopModel,
+        scan: Scan,
+        theta: _Float,
+        prior: tuple[_Float, _Float],
+        sigma_m: _Float | None,
+        width: float,
+    ) -> _Point:
+        """Evaluate a place; without a noise with that of the place times `width`."""
+        seen = model.prediction(theta, scan)
+        sigma = width * model.sigma_m(seen) if sigma_m is None else sigma_m
+        information, gradient = np.empty((len(theta), len(theta))), np.empty(len(theta))
+        cost, explained = sums(scan, seen, sigma, model.outlier_density, information, gradient)
+        mean, precision = prior
+        off = theta - mean
+        off[2] = math.remainder(off[2], math.tau)
+        pull = precision @ off
+        return cls(model, scan, theta, mean, precision, sigma, cost + float(off @ pull), information + precision,
+                   gradient - pull, explained)  # fmt: skip
+
+    def moved(self, step: _Float) -> Self:
+        """Return the place a step away, with the same noise."""
+        prior = (self.mean, self.precision)
+        return type(self).at(self.model, self.scan, self.theta + step, prior, self.sigma_m, 1.0)  # type: ignore[return-value]
+
+
+def fit_stop(
+    model: StopModel,
+    scan: Scan,
+    start: _Float,
+    prior: tuple[_Float, _Float] | None = None,
+    widths: tuple[float, ...] = _WIDTHS,
+) -> StopFit:
+    """Descend from a start to a pose that explains a stop.
+
+    Parameters
+    ----------
+    model : StopModel
+    scan : Scan
+    start : (3,) or (6 + 2 S,) float64
+        Pose, or all unknowns.
+    prior : (mean, precision), optional
+        (3,) and (3, 3): of the pose.
+    widths : tuple of float
+        Noise of the rounds, in that of the rig.
+
+    Returns
+    -------
+    StopFit
+    """
+    n = N_BODY + 2 * len(model.rig.sensor)
+    theta, mean, precision = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    theta[: len(start)] = start
+    precision[range(3, n), range(3, n)] = model.unknowns_std**-2.0
+    if prior is not None:
+        mean[:3], precision[:3, :3] = prior
+    longest = model.longest
+    for k in range(_MOST_ROUNDS):
+        width = widths[min(k, len(widths) - 1)]
+        point = _Point.at(model, scan, theta, (mean, precision), None, width)
+        point, _, _ = descend(point, longest, most=_MOST_STEPS, done=_DONE, shares=(1.0, 0.5, 0.2))
+        moved = point.theta - theta
+        theta = point.theta
+        if k + 1 >= len(widths) and float(moved @ point.information @ moved) < 10 * _DONE:
+            break
+    return _as_fit(_Point.at(model, scan, theta, (mean, precision), None, widths[-1]), bool(prior))
+
+
+def _as_fit(point: _Point, with_prior: bool) -> StopFit:
+    """Return the fit at a place; its cost counts the width of the noise there, which differs from place to place."""
+    observed = np.isfinite(point.scan.depth_m)
+    width = point.sigma_m[observed]
+    kappa = point.model.outlier_density * width * math.sqrt(2 * math.pi)
+    cost = point.cost + 2 * float(np.log(width / (1 + kappa)).sum())
+    information = point.information
+    root = np.sqrt(np.maximum(np.diag(information), 1e-300))
+    covariance = np.linalg.pinv(information / np.outer(root, root), hermitian=True) / np.outer(root, root)
+    if not with_prior and not np.all(np.diag(information)[:3] > 1e-6):
+        covariance[:3, :3] = np.inf
+    theta = point.theta.copy()
+    theta[2] = math.remainder(theta[2], math.tau)
+    return StopFit(theta, covariance, cost, point.explained, int(observed.sum()))

@@ -1,0 +1,187 @@
+"""Depths that columns of zones see of vertical walls: the footprint of a column integrated over the visible outline.
+
+In the frame of a sensor (u along the boresight, v to the left) a direction is τ = v / u, and the inverse depth of a
+wall is linear in τ: u⁻¹ = A + B τ with A u + B v = 1 on the wall. Between neighbouring ends of walls, sorted by τ, one
+wall is the nearest, for no two pieces cross. The depth of a column is the mean of u over its footprint, a triangle in
+τ. Its slopes are exact: those of the depth inside an interval, and at an end the jump of depth times the motion of the
+end.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from phasemark.matcher.locate.kernel_arguments import Outline
+
+_NEAREST_M = 1e-3
+"""A wall is cut off at this depth."""
+_NODES = np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)])
+_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+N_SLOPES = 4
+"""Slopes of a depth: by a move of the sensor along u and along v, by its yaw, and by the angle of the column."""
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def column_depths(
+    poses: NDArray[np.float64],
+    sensor: NDArray[np.int64],
+    outline: Outline,
+    step_rad: NDArray[np.float64],
+    columns: NDArray[np.int64],
+    footprint: NDArray[np.float64],
+    depth_m: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    wall_slope: NDArray[np.float64],
+    spread_m: NDArray[np.float64],
+    share: NDArray[np.float64],
+) -> None:
+    """Compute the depth of each column at poses of sensors, with its slopes.
+
+    Parameters
+    ----------
+    poses : (n, 3) float64
+        x, y (m) and yaw (rad) of a sensor in the frame of the map.
+    sensor : (n,) int64
+        Which sensor each pose is of.
+    outline : Outline
+    step_rad : (S,) float64
+        Angle between neighbouring columns; column 0 is the leftmost.
+    columns : (S,) int64
+        Number of columns.
+    footprint : (S,) float64
+        Base of the triangle, in columns.
+    depth_m : (n, C) float64
+        Result: mean distance along the boresight; NaN where no wall is seen, and of columns a sensor does not have.
+    slope : (n, C, 4) float64
+        Result, in the order of :data:`N_SLOPES`.
+    wall_slope : (n, C, w) float64
+        Result: by the displacement of each wall; of no pose (0, C, w): not computed.
+    spread_m : (n, C) float64
+        Result: standard deviation of the depth within the footprint.
+    share : (n, C) float64
+        Result: share of the footprint on walls.
+    """
+    pieces, wall, normal, with_walls = outline.pieces, outline.wall, outline.normal, len(wall_slope) > 0
+    m, most = len(pieces), depth_m.shape[1]
+    low, high = np.empty(m), np.empty(m)
+    a, b, owner = np.empty(m), np.empty(m), np.empty(m, np.int64)
+    end, end_owner = np.empty((2 * m + 2, 3)), np.empty(2 * m + 2, np.int64)
+    centre, width = np.empty(most), np.empty(most)
+    total = np.empty((most, N_SLOPES + 3))
+    weight_slope = np.empty((most, N_SLOPES))
+    for k in range(len(poses)):
+        s = sensor[k]
+        first, last = np.inf, -np.inf
+        n = columns[s]
+        for c in range(n):
+            centre[c] = np.tan((0.5 * (n - 1) - c) * step_rad[s])
+            width[c] = 0.5 * footprint[s] * abs(step_rad[s]) * (1 + centre[c] ** 2)
+            first, last = min(first, centre[c] - width[c]), max(last, centre[c] + width[c])
+        x, y, cos, sin = poses[k, 0], poses[k, 1], np.cos(poses[k, 2]), np.sin(poses[k, 2])
+        seen, ends = 0, 2
+        end[0], end[1] = first, last
+        for j in range(m):
+            ax, ay, bx, by = pieces[j, 0] - x, pieces[j, 1] - y, pieces[j, 2] - x, pieces[j, 3] - y
+            ua, va, ub, vb = cos * ax + sin * ay, cos * ay - sin * ax, cos * bx + sin * by, cos * by - sin * bx
+            if ua < _NEAREST_M and ub < _NEAREST_M:
+                continue
+            cross = ua * vb - va * ub
+            if abs(cross) < 1e-12:
+                continue
+            real_a, real_b = ua >= _NEAREST_M, ub >= _NEAREST_M
+            ta = va / ua if real_a else (va + (vb - va) * (_NEAREST_M - ua) / (ub - ua)) / _NEAREST_M
+            tb = vb / ub if real_b else (va + (vb - va) * (_NEAREST_M - ua) / (ub - ua)) / _NEAREST_M
+            if max(ta, tb) <= first or min(ta, tb) >= last:
+                continue
+            low[seen], high[seen] = min(ta, tb), max(ta, tb)
+            a[seen], b[seen] = (vb - va) / cross, (ua - ub) / cross
+            owner[seen] = wall[j]
+            seen += 1
+            if real_a and first < ta < last:
+                end[ends, 0], end[ends, 1], end[ends, 2] = ta, ua, va
+                end_owner[ends] = wall[j]
+                ends += 1
+            if real_b and first < tb < last:
+                end[ends, 0], end[ends, 1], end[ends, 2] = tb, ub, vb
+                end_owner[ends] = wall[j]
+                ends += 1
+        order = np.argsort(end[:ends, 0])
+        total[:] = 0.0
+        weight_slope[:] = 0.0
+        depth_m[k] = np.nan
+        slope[k] = 0.0
+        spread_m[k] = 0.0
+        share[k] = 0.0
+        if with_walls:
+            wall_slope[k] = 0.0
+        before = -1
+        for i in range(ends - 1):
+            here, there = end[order[i], 0], end[order[i + 1], 0]
+            if there - here < 1e-12 and i + 1 < ends - 1:
+                nearest = before
+            else:
+                middle, nearest, best = 0.5 * (here + there), -1, 0.0
+                for j in range(seen):
+                    if low[j] <= middle <= high[j]:
+                        inverse = a[j] + b[j] * middle
+                        if inverse > best:
+                            nearest, best = j, inverse
+            if i and nearest != before:
+                left = 1 / (a[before] + b[before] * here) if before >= 0 else 0.0
+                right = 1 / (a[nearest] + b[nearest] * here) if nearest >= 0 else 0.0
+                ue, ve = end[order[i], 1], end[order[i], 2]
+                motion = (ve / ue**2, -1 / ue, -(1 + here**2))
+                e = end_owner[order[i]]
+                nu, nv = cos * normal[e, 0] + sin * normal[e, 1], cos * normal[e, 1] - sin * normal[e, 0]
+                wall_motion = (nv * ue - ve * nu) / ue**2
+                gained = (1.0 if before >= 0 else 0.0) - (1.0 if nearest >= 0 else 0.0)
+                for c in range(n):
+                    weight = (1 - abs(here - centre[c]) / width[c]) / width[c]
+                    if weight > 0:
+                        for p in range(3):
+                            total[c, 1 + p] += weight * (left - right) * motion[p]
+                            weight_slope[c, p] += weight * gained * motion[p]
+                        if with_walls:
+                            wall_slope[k, c, e] += weight * (left - right) * wall_motion
+            before = nearest
+            if nearest < 0:
+                continue
+            an, bn, e = a[nearest], b[nearest], owner[nearest]
+            nu, nv = cos * normal[e, 0] + sin * normal[e, 1], cos * normal[e, 1] - sin * normal[e, 0]
+            away = an * nu + bn * nv
+            for c in range(n):
+                for side in range(2):
+                    lo = max(here, centre[c] - width[c] if side == 0 else centre[c])
+                    hi = min(there, centre[c] if side == 0 else centre[c] + width[c])
+                    if hi <= lo:
+                        continue
+                    for g in range(3):
+                        tau = 0.5 * (lo + hi) + 0.5 * (hi - lo) * _NODES[g]
+                        weight = _WEIGHTS[g] * (hi - lo) * (1 - abs(tau - centre[c]) / width[c]) / width[c]
+                        z = 1 / (an + bn * tau)
+                        total[c, 0] += weight * z
+                        # u⁻¹ = A + B τ: a move along u or v changes it by A or B times itself
+                        total[c, 1] -= weight * an * z
+                        total[c, 2] -= weight * bn * z
+                        total[c, 3] += weight * z * (tau - bn * z * (1 + tau * tau))
+                        total[c, 4] += weight * z * tau
+                        total[c, 5] += weight * z * z
+                        total[c, 6] += weight
+                        if with_walls:
+                            wall_slope[k, c, e] += weight * z * away
+        for c in range(n):
+            hit = total[c, 6]
+            share[k, c] = hit
+            if hit < 1e-6:
+                continue
+            z = total[c, 0] / hit
+            depth_m[k, c] = z
+            spread_m[k, c] = np.sqrt(max(0.0, total[c, 5] / hit - z * z))
+            for p in range(2):
+                slope[k, c, p] = (total[c, 1 + p] - z * weight_slope[c, p]) / hit
+            slope[k, c, 2] = (total[c, 3] - z * weight_slope[c, 2]) / hit
+            if with_walls:
+                wall_slope[k, c] /= hit
+            slope[k, c, 3] = slope[k, c, 2] - total[c, 4] / hit

@@ -1,0 +1,307 @@
+"""A robot among walls: depths of columns, fits of stops, what is accepted, files and their faults."""
+
+import math
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from rig_trials import RING, free_poses, random_room, ring_rig, room
+from scipy.stats import chi2
+
+from phasemark import InputFileError, UsageError
+from phasemark.cli import main
+from phasemark.matcher.locate import Locator, Rig, WallMap, read_rig, read_rig_recording, read_wall_map
+from phasemark.matcher.locate.kernel_arguments import Scan
+from phasemark.matcher.locate.scan_fit import StopModel
+from phasemark.matcher.locate.scan_rows import SENSOR_YAW
+from phasemark.matcher.locate.simulated import recording_bytes, simulated_recording
+from phasemark.matcher.locate.smoothing import GYRO, smoothed
+
+POST = {"from": [1.6, 1.1], "to": [1.9, 1.3], "thickness_m": 0.05}
+
+
+def brute_force_depth(outline, pose, azimuth, step, footprint=2.5, rays=6001):
+    """Mean depth of a column over a triangle of rays, each met with every face."""
+    x, y, yaw = pose
+    centre = math.tan(azimuth)
+    width = 0.5 * footprint * step * (1 + centre**2)
+    tau = centre + width * (np.arange(rays) + 0.5 - rays / 2) / (rays / 2)
+    ray = np.stack([np.cos(yaw) - tau * np.sin(yaw), np.sin(yaw) + tau * np.cos(yaw)], axis=-1)
+    nearest = np.full(rays, np.inf)
+    for ax, ay, bx, by in outline.pieces:
+        across = ray[:, 0] * (by - ay) - ray[:, 1] * (bx - ax)
+        depth = ((ax - x) * (by - ay) - (ay - y) * (bx - ax)) / across
+        place = ((ax - x) * ray[:, 1] - (ay - y) * ray[:, 0]) / across
+        nearest = np.where((depth > 0) & (place >= 0) & (place <= 1) & (depth < nearest), depth, nearest)
+    return np.average(nearest, weights=1 - np.abs(tau - centre) / width)
+
+
+def scan_of(pose_count=4, columns=8, frames=3):
+    time_s = np.arange(frames) / 10
+    track = np.column_stack([0.1 * time_s, -0.05 * time_s, 0.5 * time_s])
+    return Scan(time_s, np.zeros((frames, pose_count, columns)), time_s.copy(), track)
+
+
+def test_the_depth_of_a_column_is_the_mean_over_its_footprint():
+    model = StopModel.of(ring_rig(4), room(wall=[POST]).outline())
+    theta = np.zeros(14)
+    theta[:3] = [1.0, 0.8, 0.4]
+    seen = model.prediction(theta, scan_of(frames=1))
+    step = float(model.numbers.step_rad[0])
+    for s in range(4):
+        yaw = theta[2] + model.numbers.yaw_rad[s]
+        cos, sin = math.cos(theta[2]), math.sin(theta[2])
+        x, y = model.numbers.x_m[s], model.numbers.y_m[s]
+        place = (theta[0] + cos * x - sin * y, theta[1] + sin * x + cos * y, yaw)
+        for c in (0, 3, 7):
+            expected = brute_force_depth(model.outline, place, (3.5 - c) * step, step)
+            assert_allclose(seen.depth_m[0, s, c], expected, atol=2e-3)  # of 6001 rays at an edge, one may be wrong
+
+
+def test_slopes_are_those_of_the_depths_also_where_a_wall_ends_in_a_footprint():
+    model = StopModel.of(ring_rig(4), room(wall=[POST]).outline())
+    rng, step = np.random.default_rng(3), 1e-6
+    for _ in range(5):
+        theta = np.concatenate([[rng.uniform(0.4, 1.2), rng.uniform(0.4, 2.5), rng.uniform(-3, 3)],
+                                0.01 * rng.standard_normal(11)])  # fmt: skip
+        theta[5] = 0.003  # no frame at a knot of the odometry, where the speed changes
+        slope = model.prediction(theta, scan_of()).slope
+        for p in range(14):
+            moved = [theta + sign * step * (np.arange(14) == p) for sign in (1, -1)]
+            up, down = (model.prediction(one, scan_of()).depth_m for one in moved)
+            exact = slope[..., p] if p < 6 else np.zeros(up.shape)
+            if 6 <= p:
+                exact[:, (p - 6) % 4] = 1.0 if p < 10 else slope[:, (p - 6) % 4, :, SENSOR_YAW]
+            # a difference across a corner of two walls has the size of the step; slopes are some metres a radian
+            assert np.quantile(np.abs((up - down) / (2 * step) - exact), 0.99) < 5e-3
+
+
+def test_slopes_of_walls_are_those_of_a_map_whose_wall_is_displaced():
+    base, step = room(wall=[POST | {"thickness_m": 0.0}]), 1e-6
+    rig, theta = ring_rig(4), np.zeros(14)
+    theta[:3] = [1.0, 0.8, 0.4]
+    slope = StopModel.of(rig, base.outline()).prediction(theta, scan_of(), walls=True).wall_slope
+    for k in range(len(base.walls)):
+        by = step * (np.arange(len(base.walls)) == k)
+        up, down = (
+            StopModel.of(rig, base.with_walls_moved(sign * by).outline()).prediction(theta, scan_of()).depth_m
+            for sign in (1, -1)
+        )
+        # columns at a corner are left out: a displaced wall opens a gap there as wide as the step
+        assert np.quantile(np.abs((up - down) / (2 * step) - slope[..., k]), 0.8) < 1e-6
+
+
+def test_poses_of_random_rooms_have_the_covariance_that_is_stated():
+    nees, wrong, accepted, n = trials(maps=6, stops=12, seed=5)
+    assert wrong == 0
+    assert accepted > 0.5 * n
+    low, high = chi2.ppf([0.0005, 0.9995], 3 * accepted)  # 99.9 %
+    assert 0.97 * low < nees.sum() < 1.05 * high  # columns at edges are not linear: some per cent
+
+
+@pytest.mark.soak
+def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated():
+    nees, wrong, _, _ = trials(maps=20, stops=250, seed=6)
+    assert wrong == 0
+    assert 0.95 < nees.mean() / 3 < 1.05  # N = 5000 less what is undetermined: 0.012 is one standard deviation
+
+
+def trials(maps, stops, seed):
+    """NEES of accepted poses; wrong, accepted and all counts. Rigs have 1 … 8 sensors."""
+    rng, nees, wrong = np.random.default_rng(seed), [], 0
+    for _ in range(maps):
+        one = random_room(rng)
+        rig = ring_rig(int(rng.integers(1, 9)), noise={"outliers": 0.02})
+        poses = free_poses(one, stops, rng)
+        recording = simulated_recording(one, rig, poses, rng)
+        std = np.array([0.2, 0.2, 0.09])
+        for answer, pose in zip(
+            Locator(one, rig).locate(recording, poses + std * rng.standard_normal(poses.shape), std), poses, strict=True
+        ):
+            off = answer.pose - pose
+            off[2] = math.remainder(off[2], math.tau)
+            if answer.accepted:
+                nees.append(off @ np.linalg.solve(answer.covariance, off))
+                beyond = (np.abs(off) > [0.1, 0.1, math.radians(5)]).any()
+                wrong += bool(beyond and nees[-1] > chi2.isf(1e-5, 3))  # 3 standard deviations may be the tolerance
+    return np.array(nees), wrong, len(nees), maps * stops
+
+
+def test_a_square_room_is_ambiguous_and_all_four_poses_are_listed():
+    square = WallMap(walls_m=[[0, 0, 3, 0], [3, 0, 3, 3], [3, 3, 0, 3], [0, 3, 0, 0]])
+    rig, pose = ring_rig(4), np.array([[1.0, 0.7, 0.3]])
+    recording = simulated_recording(square, rig, pose, np.random.default_rng(1))
+    answer = Locator(square, rig).locate(recording)[0]
+    assert (answer.accepted, answer.reason) == (False, "ambiguous")
+    turned = [(1.0, 0.7, 0.3), (2.3, 1.0, 1.871), (2.0, 2.3, -2.842), (0.7, 2.0, -1.271)]  # by quarter turns
+    found = sorted((one.x_m, one.y_m, one.yaw_rad) for one in answer.alternatives)
+    assert_allclose(found, sorted(turned), atol=0.05)
+    near = Locator(square, rig).locate(recording, pose + 0.1, (0.2, 0.2, 0.2))[0]
+    assert near.accepted
+
+
+def test_a_corridor_leaves_the_place_along_it_undetermined():
+    corridor = WallMap(walls_m=[[-20, 0, 20, 0], [-20, 1.2, 20, 1.2]])
+    rig = ring_rig(4)
+    recording = simulated_recording(corridor, rig, [[0.0, 0.6, 0.1]], np.random.default_rng(2))
+    answer = Locator(corridor, rig).locate(recording, [[0.1, 0.5, 0.0]], (0.3, 0.3, 0.2))[0]
+    assert (answer.accepted, answer.reason) == (False, "undetermined")
+    assert math.sqrt(answer.covariance[0, 0]) > 0.2
+    assert math.sqrt(answer.covariance[1, 1]) < 0.02
+
+
+def test_something_in_view_that_is_not_in_the_map_moves_no_pose_by_more_than_it_states():
+    one, rig = room(wall=[POST]), ring_rig(4)
+    recording = simulated_recording(one, rig, [[1.0, 0.8, 0.4]], np.random.default_rng(4))
+    recording.depth_m[0, 0, 1, 2:6] = 0.35  # another robot before the second sensor
+    answer = Locator(one, rig).locate(recording, [[1.1, 0.7, 0.5]], (0.2, 0.2, 0.2))[0]
+    assert answer.accepted
+    off = answer.pose - [1.0, 0.8, 0.4]
+    assert off @ np.linalg.solve(answer.covariance, off) < 16.3  # 99.9 % of χ² with 3 degrees of freedom
+
+
+def drive(rng, stops=12):
+    one, rig = room(wall=[POST]), ring_rig(4)
+    angle = np.linspace(0, 1.5 * math.pi, stops)
+    path = np.column_stack([1.4 + 0.8 * np.cos(angle), 1.6 + 0.7 * np.sin(angle), angle])
+    return one, rig, path, simulated_recording(one, rig, path, rng, drift=GYRO)
+
+
+def test_a_drive_is_followed_from_its_odometry_and_smoothing_makes_it_no_worse():
+    one, rig, path, recording = drive(np.random.default_rng(7))
+    answers = Locator(one, rig).follow(recording)
+    assert all(answer.accepted for answer in answers)
+    joined = smoothed(recording, answers)
+
+    def rms(found):
+        off = np.array([answer.pose for answer in found]) - path
+        off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
+        return np.sqrt((off**2).mean(axis=0))
+
+    assert rms(joined)[2] < rms(answers)[2]
+    assert (rms(joined) < 1.1 * rms(answers)).all()
+    # an answer that is far off, but sure of itself, is left out by χ²
+    answers[5] = type(answers[5])(**(vars(answers[5]) | {"x_m": answers[5].x_m + 0.8}))
+    again = smoothed(recording, answers)
+    assert not again[5].accepted
+    assert np.hypot(*(again[5].pose - path[5])[:2]) < 0.2
+
+
+def test_a_recording_is_read_as_it_was_written_and_its_faults_are_named(tmp_path):
+    _, rig, _, recording = drive(np.random.default_rng(8), stops=3)
+    file = tmp_path / "drive.npz"
+    file.write_bytes(recording_bytes(recording, rig))
+    again = read_rig_recording(file, rig)
+    assert_allclose(again.depth_m, recording.depth_m, atol=1e-6)  # float32 in the file
+    assert_allclose(again.odometry, recording.odometry)
+    arrays = dict(np.load(file))
+
+    def refused(message, **changed):
+        np.savez(file, **{name: value for name, value in (arrays | changed).items() if value is not None})
+        with pytest.raises(InputFileError, match=message):
+            read_rig_recording(file, rig)
+
+    refused("no sensor 's3' of the rig", sensor=np.array(["s0", "s1", "s2", "behind"]))
+    refused("must have an array 'frame_time_s'", frame_time_s=None)
+    refused("must have an array 'z_m' or 'range_m'", z_m=None)
+    refused("has 5 columns", z_m=arrays["z_m"][..., :5])
+    twice = np.repeat(arrays["z_m"], 2, axis=1)
+    odometry = {name: np.repeat(arrays[name], 2, axis=1) for name in ("odo_dx_m", "odo_dy_m", "odo_dyaw_rad")}
+    refused("'frame_time_s' must rise, got -0.1 s", z_m=twice, frame_time_s=np.array([0.0, -0.1]), **odometry)
+    file.write_bytes(b"PK\x03\x04 and no more")
+    with pytest.raises(InputFileError, match="not an NPZ file"):
+        read_rig_recording(file, rig)
+
+
+def test_a_sensor_that_is_stuck_is_left_out_and_odometry_that_jumps_refuses_the_stop(tmp_path):
+    one, rig = room(wall=[POST]), ring_rig(4)
+    track = np.column_stack([np.zeros(4), np.zeros(4), [0.0, 0.1, 0.2, 0.3]])
+    recording = simulated_recording(
+        one, rig, [[1.0, 0.8, 0.4]] * 2, np.random.default_rng(9), time_s=np.arange(4) / 10, moved=track
+    )
+    recording.depth_m[0, :, 2] = recording.depth_m[0, 0, 2]
+    recording.moved[1, 2, 0] += 3.0
+    file = tmp_path / "faults.npz"
+    file.write_bytes(recording_bytes(recording, rig))
+    again = read_rig_recording(file, rig)
+    assert again.notes == ("s2 is stuck", "odometry jumps")
+    answers = Locator(one, rig).locate(again, [[1.0, 0.8, 0.4]] * 2)
+    assert [answer.reason for answer in answers] == ["", "odometry jumps"]
+    assert answers[0].observed == np.isfinite(recording.depth_m[0, :, [0, 1, 3]]).sum()
+
+
+def test_rows_are_reduced_to_columns_of_valid_zones(tmp_path):
+    rig = Rig(sensor=[{"name": "front"}], reduction={"rows": [2, 5]})
+    zones, status = np.full((1, 1, 1, 8, 8), 1.5), np.full((1, 1, 1, 8, 8), 5)
+    zones[..., 2:4, 3], status[..., 0, :] = [[[[9.0, 1.7]]]], 255
+    status[..., 2, 3] = 255
+    file = tmp_path / "zones.npz"
+    np.savez(file, z_m=zones, status=status, frame_time_s=[0.0])
+    assert_allclose(read_rig_recording(file, rig).depth_m[0, 0, 0], [1.5] * 8)  # median of 1.7, 1.5, 1.5
+
+
+def test_maps_and_rigs_that_cannot_be_are_refused_in_one_line(tmp_path):
+    with pytest.raises(UsageError, match=r"'walls_m.1' must not cross 'walls_m.0'"):
+        WallMap(walls_m=[[0, 0, 2, 0], [1, -1, 1, 1]])
+    with pytest.raises(UsageError, match="longer than 1 mm"):
+        WallMap(walls_m=[[1, 1, 1, 1]])
+    with pytest.raises(UsageError, match="at least one wall"):
+        WallMap()
+    with pytest.raises(UsageError, match="must be a name of its own, got 'a' twice"):
+        Rig(sensor=[{"name": "a"}, {"name": "a"}])
+    with pytest.raises(UsageError, match="height_m"):
+        WallMap(box=[{"x_m": 0, "y_m": 0, "size_m": [1, 1, 0.2]}], height_m=0.5).outline()
+    file = tmp_path / "maps.toml"
+    file.write_text('runs.one = "a"\n[maps.a]\nwalls_m = [[0, 0, 1, 0]]\n[maps.b]\nwalls_m = [[0, 0, 2, 0]]\n')
+    assert read_wall_map(file, "one").walls[0].to_m == (1, 0)
+    with pytest.raises(InputFileError, match="no map 'c', must be one of a, b"):
+        read_wall_map(file, "c")
+    file.write_text("[maps.a]\nwalls_m = [[0, 0, 1, 0], [0.5, -1, 0.5, 1]]\n")
+    with pytest.raises(UsageError, match=r"maps.a: 'walls_m.1' must not cross"):
+        read_wall_map(file)
+
+
+def test_the_outline_of_bodies_is_their_section_at_the_height_of_the_sensors():
+    bodies = WallMap(box=[{"x_m": 1, "y_m": 2, "yaw_deg": 90, "size_m": [2, 1, 1]}],
+                     landmark=[{"class": "cylinder", "x_m": -1, "y_m": 0}], height_m=0.2)  # fmt: skip
+    pieces = bodies.outline().pieces
+    assert_allclose(pieces[:4, ::2].min(), 0.5)
+    assert_allclose(pieces[:4, 1::2].max(), 3.0)
+    radius = np.hypot(pieces[4:, ::2] + 1, pieces[4:, 1::2])
+    assert np.ptp(radius) < 5e-3  # the corners of a polygon around a circle, and the box on the other side
+    assert math.isclose(RING, 0.03)
+
+
+def test_a_rig_file_is_read_as_it_was_written(tmp_path):
+    rig = ring_rig(3, reduction={"rows": [2, 5]})
+    file = tmp_path / "rig.toml"
+    file.write_text(rig.to_toml())
+    again = read_rig(file)
+    assert again.names == rig.names
+    for one, other in zip(again.numbers(), rig.numbers(), strict=True):
+        assert_allclose(one, other, atol=1e-6)  # seven digits in the file
+
+
+def test_the_command_writes_a_line_a_stop(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    one, rig, path, recording = drive(np.random.default_rng(10), stops=4)
+    (tmp_path / "rig.toml").write_text(rig.to_toml())
+    walls = "\n".join(
+        f"[[wall]]\nfrom = {list(w.from_m)}\nto = {list(w.to_m)}\nthickness_m = {w.thickness_m}" for w in one.walls
+    )
+    (tmp_path / "room.toml").write_text(walls)
+    (tmp_path / "drive.npz").write_bytes(recording_bytes(recording, rig))
+    rows = [f"{k},{x},{y},{math.degrees(a)}" for k, (x, y, a) in enumerate(path)]
+    (tmp_path / "start.csv").write_text("\n".join(["stop,x_m,y_m,yaw_deg", *rows]))
+    files = [str(tmp_path / name) for name in ("room.toml", "rig.toml", "drive.npz")]
+    out = tmp_path / "poses.csv"
+    for options in (["--odometry", "--smooth"], ["--start", str(tmp_path / "start.csv"), "--frames", "1"]):
+        assert main(["locate", *files, *options, "-o", str(out), "--force"]) == 0
+        lines = out.read_text().splitlines()
+        assert lines[0].startswith("run,stop,robot,x_m,y_m,yaw_deg,xx,xy,xa,yy,ya,aa,accepted,reason")
+        assert [line.split(",")[1] for line in lines[1:]] == ["0", "1", "2", "3"]
+        assert Counter(line.split(",")[12] for line in lines[1:]) == {"1": 4}
+    assert "accepted" in capsys.readouterr().out
+    assert main(["locate", *files, "--frames", "9", "-o", str(out), "--force"]) == 2
+    assert "'frames' must be 1 … 1" in capsys.readouterr().err.replace("--frames", "'frames'")
