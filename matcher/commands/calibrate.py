@@ -30,6 +30,7 @@ from phasemark.data.commands.options import (
     a_class,
 )
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
+from phasemark.matcher.commands.calibrate_rig import calibrate_rig_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
@@ -46,7 +47,7 @@ Names = Annotated[str, Shown(metavar="NAMES")]
 
 def calibrate_camera(
     bank_or_class: Annotated[str, Shown(autocompletion=a_class)],
-    frames: list[Path],
+    frames: list[Path] | None = None,
     *,
     poses: Annotated[list[Path], Shown(metavar="CSV")],
     out: Out,
@@ -70,6 +71,8 @@ def calibrate_camera(
     floor: Floor = None,
     reading: FrameReading,
     plot: Path | None = None,
+    rig_file: Path | None = None,
+    map_file: Path | None = None,
     workers: Workers = None,
     as_json: Json = False,
     write_distrusted: bool = False,
@@ -82,15 +85,18 @@ def calibrate_camera(
     sensor with a lens has its terms in place of half angles, estimated where --free names them: fx, fy, cx, cy, k1,
     k2 ... (all: lens). A result that cannot be trusted is not written (exit code 3) without --write-distrusted.
 
+    With --rig and --map: what several range sensors on one robot share, from recordings whose stops have poses. All
+    arguments are recordings; --free takes yaw, position, delay, offset, scale, fov and walls.
+
     Parameters
     ----------
     bank_or_class
-        A bank, or a class of the catalogue.
+        A bank, or a class of the catalogue; with --rig a recording.
     frames
         Measured frames: a file for each pose, or one of them all, in order; with --moving recordings.
     poses
         Columns distance_m,delta_deg[,bearing_deg] or x_m,y_m,heading_deg [,t_ms,pitch_deg,roll_deg]; once for each
-        recording.
+        recording. With --rig: run,stop,robot,x_m,y_m,yaw_deg.
     out
         The sensor file to write, .toml.
     class_name
@@ -128,6 +134,10 @@ def calibrate_camera(
         chooses.
     plot
         The figure of the residuals, .png; beside the sensor file otherwise.
+    rig_file
+        The assumed rig of several sensors, .toml.
+    map_file
+        The walls that it was among, .toml.
     write_distrusted
         Write a result that cannot be trusted, too; the file then names the doubts.
     """
@@ -135,6 +145,11 @@ def calibrate_camera(
     from phasemark.matcher import calibrate
     from phasemark.matcher.calibration.known_poses import read_poses
 
+    if rig_file is not None:
+        files, chosen = [Path(bank_or_class), *(frames or ())], None if free is None else _names(free)
+        return calibrate_rig_file(rig_file, map_file, files, poses, chosen, out, write_distrusted, force, as_json)
+    if not frames:
+        raise UsageError("missing argument FRAMES: measured frames of the landmark")
     figure = plot or out.with_suffix(".png")
     refuse_other_files(out, ".toml", "the sensor")
     refuse_other_files(figure, ".png")
@@ -164,13 +179,7 @@ def calibrate_camera(
             workers=workers or min(processors(), 4),
             progress=progress,
         )
-    found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
-    _write_calibration(found, out, figure, base_name, force, write_distrusted)
-    if as_json:
-        echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
-        return
-    _echo_calibration(found)
-    echo(out, figure)
+    _write_calibration(found, out, figure, base_name, force, write_distrusted, as_json)
 
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
@@ -234,11 +243,12 @@ def _start(
 
 
 def _write_calibration(
-    found: Calibration, out: Path, figure: Path, base_name: str, force: bool, write_distrusted: bool
+    found: Calibration, out: Path, figure: Path, base_name: str, force: bool, write_distrusted: bool, as_json: bool
 ) -> None:
-    """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted."""
+    """Write the sensor file and the figure of the residuals, unless the calibration cannot be trusted; print it."""
     from phasemark.matcher.calibration.report import residual_figure
 
+    found = replace(found, notes=tuple(map(in_flags, found.notes)), cause=in_flags(found.cause))
     if found.doubts and not write_distrusted:
         raise InputFileError(
             f"nothing was written, for the calibration cannot be trusted: {'; '.join(found.doubts)}. Likely cause:"
@@ -246,6 +256,11 @@ def _write_calibration(
         )
     write_figure(figure, residual_figure(found), force, dpi=100)
     write_file(out, found.to_toml(base_name=readable(base_name)), force)
+    if as_json:
+        echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
+        return
+    _echo_calibration(found)
+    echo(out, figure)
 
 
 def _names(text: str) -> list[str]:

@@ -8,6 +8,9 @@ if TYPE_CHECKING:
     from phasemark.matcher.locate.locator import LocatedPose, Locator, OdometryDrift, PoseCandidate
     from phasemark.matcher.locate.recording import RigRecording, read_rig_recording
     from phasemark.matcher.locate.rig import Rig, RigSensor, read_rig
+    from phasemark.matcher.locate.rig_calibration import RigCalibration, calibrate_rig
+    from phasemark.matcher.locate.simulated import recording_bytes, simulated_recording
+    from phasemark.matcher.locate.smoothing import smoothed
     from phasemark.matcher.locate.wall_map import Wall, WallMap, read_wall_map
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
@@ -18,11 +21,16 @@ __all__ = [
     "OdometryDrift",
     "PoseCandidate",
     "Rig",
+    "RigCalibration",
     "RigRecording",
     "RigSensor",
     "Wall",
     "WallMap",
+    "calibrate_rig",
     "read_rig",
     "read_rig_recording",
     "read_wall_map",
+    "recording_bytes",
+    "simulated_recording",
+    "smoothed",
 ]

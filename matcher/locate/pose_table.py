@@ -19,6 +19,11 @@ def pose_csv(answers: Sequence[LocatedPose], robot_key: str = "robot") -> str:
     answers : sequence of LocatedPose
     robot_key : str
         Heading of the column of robots.
+
+    Returns
+    -------
+    str
+        Alternatives stand as (x y yaw: weight).
     """
     head = ["run", "stop", robot_key, "x_m", "y_m", "yaw_deg", *_COVARIANCE, "accepted", "reason", "explained",
             "observed", "note", "alternatives"]  # fmt: skip
@@ -26,8 +31,8 @@ def pose_csv(answers: Sequence[LocatedPose], robot_key: str = "robot") -> str:
     rows = [head]
     for one in answers:
         covariance = [float(one.covariance[i, j]) * unit[i] * unit[j] for i, j in _COVARIANCE.values()]
-        others = "; ".join(
-            f"{c.x_m:.4f} {c.y_m:.4f} {math.degrees(c.yaw_rad):.3f} {c.weight:.4g}" for c in one.alternatives
+        others = " ".join(
+            f"({c.x_m:.4f} {c.y_m:.4f} {math.degrees(c.yaw_rad):.3f}: {c.weight:.4g})" for c in one.alternatives
         )
         row = [*one.key, one.x_m, one.y_m, math.degrees(one.yaw_rad), *covariance, one.accepted, one.reason,
                one.explained, one.observed, one.note, others]  # fmt: skip

@@ -237,6 +237,16 @@ class WallMap(PlanModel):
             moved.append(wall.model_copy(update={"from_m": tuple(ends[:2].tolist()), "to_m": tuple(ends[2:].tolist())}))
         return self.model_copy(update={"wall": tuple(moved), "walls_m": ()})
 
+    def to_toml(self) -> str:
+        """Return the map as the text of a file."""
+        import tomlkit
+
+        content = self.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True)
+        document = tomlkit.document()
+        for key in sorted(content, key=lambda name: isinstance(content[name], list)):
+            document.add(key, tomlkit.item(content[key]))
+        return tomlkit.dumps(document)
+
 
 def read_wall_map(path: str | os.PathLike[str], name: str | None = None) -> WallMap:
     """Read a map from a TOML file.
