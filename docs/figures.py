@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import hashlib
 import io
 import json
 import shlex
 import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -31,6 +33,8 @@ from phasemark.data.seeds import stream
 from phasemark.landmarks import build_mesh, catalog, mesh_figure
 from phasemark.matcher import kalman_filter
 from phasemark.matcher.drive import default_drive, drive_figure, run_drive
+from phasemark.matcher.locate import Locator, smoothed
+from phasemark.matcher.locate.figures import locate_figure
 from phasemark.render import Background, Renderer, SceneRenderer, capture, preset
 from phasemark.render.figures import draw_range, landmark_limits_m
 
@@ -75,6 +79,7 @@ SOURCES = {
     "design-pareto.png": ("matcher/design/plan.toml", "matcher/design/figures.py", "render/charts.py"),
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),
+    "locate.png": ("docs/figures.py", "docs/locate.md", "matcher/locate/figures.py", "render/charts.py"),
     "multipath.png": ("docs/figures.py", "docs/multipath.md", "render/figures.py"),
     "scenes.png": ("docs/figures.py", "docs/scenes.md", "render/figures.py"),
     "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py", "render/charts.py"),
@@ -212,6 +217,15 @@ def multipath_figure() -> Figure:
     return figure
 
 
+def located_figure() -> Figure:
+    """Draw the drive of the page on a robot among walls."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):  # the page writes files
+        names = names_of_page("locate.md")
+    locator, recording = Locator(names["room"], names["rig"]), names["recording"]
+    answers = smoothed(recording, locator.follow(recording), locator)
+    return locate_figure([("", locator.model.outline, answers, names["path"])])
+
+
 def scene_figure() -> Figure:
     """Draw the scene of the page on scenes: finely, what fills most of each zone, and zones beside centre rays."""
     names = names_of_page("scenes.md")
@@ -266,6 +280,7 @@ def main() -> None:
     write(demo_figure(), "demo.png")
     write(scene_figure(), "scenes.png")
     write(multipath_figure(), "multipath.png")
+    write(located_figure(), "locate.png")
     write(drive_figure(run_drive(default_drive())), "drive.png")
     for command, figures in LEFT_BY.items():
         made = made_by(f"{command} --force", [OUT / source for source in figures.values()], runs, *PHASEMARK)

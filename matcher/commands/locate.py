@@ -14,7 +14,7 @@ from phasemark import UsageError
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.options import Count, Degrees, Force, Json, Metres, Out
-from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_file
+from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
 
 if TYPE_CHECKING:
     from phasemark.matcher.locate.locator import LocatedPose, Locator
@@ -37,6 +37,7 @@ def locate_rig(
     tolerance: Metres = 0.1,
     tolerance_yaw: Degrees = 5.0,
     out: Out,
+    plot: Path | None = None,
     as_json: Json = False,
     force: Force = False,
 ) -> None:
@@ -74,23 +75,32 @@ def locate_rig(
         The same of the heading.
     out
         The table, .csv.
+    plot
+        A figure of the poses in their maps, .png.
     """
+    from phasemark.matcher.locate.figures import locate_figure
     from phasemark.matcher.locate.pose_table import pose_csv
     from phasemark.matcher.locate.recording import read_rig_recording
     from phasemark.matcher.locate.rig import read_rig
 
     refuse_other_files(out, ".csv", "the table")
-    refuse_existing([out], force)
-    rig, answers, robot_key = read_rig(rig_file), [], "robot"
+    if plot is not None:
+        refuse_other_files(plot, ".png")
+    refuse_existing([out] if plot is None else [out, plot], force)
+    rig, answers, drawn, robot_key = read_rig(rig_file), [], [], "robot"
     std = (start_std, start_std, math.radians(start_yaw_std))
     with LongWork("locating"):
         for path in recordings:
             recording = read_rig_recording(path, rig)
             recording = recording if frames is None else recording.first_frames(frames)
             locator = _locator(map_file, map_name, rig, recording, (tolerance, math.radians(tolerance_yaw)))
-            answers += _located(locator, recording, start, odometry, std, smooth)
+            found = _located(locator, recording, start, odometry, std, smooth)
+            drawn.append((recording.run, locator.model.outline, found, None))
+            answers += found
             robot_key = recording.robot_key
     write_file(out, pose_csv(answers, robot_key), force)
+    if plot is not None:
+        write_figure(plot, locate_figure(drawn), force)
     if as_json:
         echo_json({"file": str(out), "poses": [one.as_dict() for one in answers]})
         return
@@ -131,7 +141,7 @@ def _located(
         answers = locator.follow(recording, first, std)
     else:
         answers = locator.locate(recording, starts, std)
-    return smoothed(recording, answers, locator.wall_map.part) if smooth else answers
+    return smoothed(recording, answers, locator) if smooth else answers
 
 
 def _echo_summary(answers: Sequence[LocatedPose]) -> None:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.matcher.locate.locator import LocatedPose, Locator, OdometryDrift, PoseCandidate
+    from phasemark.matcher.locate.locator import LocatedPose, Locator, PoseCandidate
     from phasemark.matcher.locate.recording import RigRecording, read_rig_recording
-    from phasemark.matcher.locate.rig import Rig, RigSensor, read_rig
+    from phasemark.matcher.locate.rig import OdometryDrift, Rig, RigSensor, read_rig
     from phasemark.matcher.locate.rig_calibration import RigCalibration, calibrate_rig
     from phasemark.matcher.locate.simulated import recording_bytes, simulated_recording
     from phasemark.matcher.locate.smoothing import smoothed

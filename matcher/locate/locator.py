@@ -65,6 +65,8 @@ class LocatedPose:
         All poses that explain the stop nearly as well, best first, the answer itself among them.
     note : str
         What is wrong with the recording there.
+    evidence : (pose, information), optional
+        Pose and inverse covariance that the stop's frames alone speak for, without the prior and the part of the map.
     """
 
     key: tuple[str, int, int]
@@ -78,6 +80,7 @@ class LocatedPose:
     reason: LocateReason = "no zones"
     alternatives: tuple[PoseCandidate, ...] = ()
     note: str = ""
+    evidence: tuple[_Float, _Float] | None = None
 
     @property
     def pose(self) -> _Float:
@@ -194,7 +197,6 @@ class Locator:
         recording: RigRecording,
         start: Mapping[int, ArrayLike] | None = None,
         start_std: ArrayLike = (0.2, 0.2, 0.09),
-        drift: OdometryDrift | None = None,
     ) -> list[LocatedPose]:
         """Locate the stops of each robot one after the other, each from the last accepted pose and the odometry.
 
@@ -205,7 +207,6 @@ class Locator:
         start : mapping of int to (3,) array_like, optional
             First pose of each robot; that of the odometry where it is left out.
         start_std : (3,) array_like
-        drift : OdometryDrift, optional
 
         Returns
         -------
@@ -221,7 +222,6 @@ class Locator:
             raise UsageError(
                 "the recording must have odometry at its stops: odometry_x_m, odometry_y_m, odometry_yaw_rad"
             )
-        drift = drift or OdometryDrift()
         first = np.diag(np.square(np.asarray(start_std, np.float64)))
         answers: dict[int, LocatedPose] = {}
         for robot in np.unique(recording.robot):
@@ -231,7 +231,7 @@ class Locator:
             for k, before in zip(own, [None, *own[:-1]], strict=True):
                 if before is not None:
                     step = relative_pose(recording.odometry[before], recording.odometry[k])
-                    mean, covariance = drift.moved(mean, covariance, step)
+                    mean, covariance = self.rig.odometry.moved(mean, covariance, step)
                 answer = self._located(recording, int(k), (mean, covariance))
                 if not answer.accepted and answer.reason in ("poor fit", "ambiguous"):
                     anywhere = self._located(recording, int(k), None)
@@ -270,7 +270,7 @@ class Locator:
         fits = self._fits(scan, prior)
         if not fits:
             return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
-        return self._answer(fits, len(scan.time_s))
+        return self._answer(fits, len(scan.time_s), prior)
 
     def _fits(self, scan: Scan, prior: tuple[_Float, _Float] | None) -> list[StopFit]:
         """Return distinct fits, best first: descents on three frames from a grid, then on all frames."""
@@ -302,11 +302,15 @@ class Locator:
                 kept.append(fit)
         return kept
 
+    def is_determined(self, covariance: _Float) -> bool:
+        """Return whether three standard deviations of a pose are within the tolerance."""
+        return bool((TOLERATED_SIGMA * np.sqrt(np.diag(covariance)) <= self._tolerance).all())
+
     @property
     def _tolerance(self) -> _Float:
         return np.array([self.tolerance_m, self.tolerance_m, self.tolerance_rad])
 
-    def _answer(self, fits: list[StopFit], frames: int) -> LocatedPose:
+    def _answer(self, fits: list[StopFit], frames: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
         """Return the best fit as the answer, or the reason to refuse it, with what explains the stop nearly as well."""
         best = fits[0]
         opinions = max(1.0, frames / _SAME_FRAMES)
@@ -332,49 +336,33 @@ class Locator:
             accepted=not reason,
             reason=reason,
             alternatives=tuple(candidates),
+            evidence=_without(best, prior),
         )
 
     def _reason(self, fits: list[StopFit], near: list[int], covariance: _Float) -> LocateReason:
         """Return why the best fit is refused; empty where it is accepted."""
         if fits[0].share < self.least_explained:
             return "poor fit"
-        std = np.sqrt(np.diag(covariance))
-        if not (TOLERATED_SIGMA * std <= self._tolerance).all():
+        if not self.is_determined(covariance):
             return "undetermined"
         others = (apart(fits[k].pose, fits[0].pose) for k in near[1:])
         return "ambiguous" if any((off > self._tolerance).any() for off in others) else ""
 
 
-@dataclass(frozen=True)
-class OdometryDrift:
-    """Standard deviations of the steps of odometry.
-
-    Parameters
-    ----------
-    per_m : float
-        Metres of a metre.
-    position_m : float
-        Of each step.
-    yaw_rad : float
-        Of each step.
-    """
-
-    per_m: float = 0.1
-    position_m: float = 0.05
-    yaw_rad: float = math.radians(1.5)
-
-    def covariance(self, step: _Float) -> _Float:
-        """Return the covariance of a step, (3, 3)."""
-        position = math.hypot(self.position_m, self.per_m * math.hypot(step[0], step[1]))
-        return np.diag(np.square([position, position, self.yaw_rad]))
-
-    def moved(self, mean: _Float, covariance: _Float, step: _Float) -> tuple[_Float, _Float]:
-        """Return mean and covariance of a pose after a step in the body's frame."""
-        cos, sin = math.cos(mean[2]), math.sin(mean[2])
-        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        by = turn @ step
-        slope = np.array([[1.0, 0.0, -by[1]], [0.0, 1.0, by[0]], [0.0, 0.0, 1.0]])
-        return mean + by, slope @ covariance @ slope.T + turn @ self.covariance(step) @ turn.T
+def _without(fit: StopFit, prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float]:
+    """Return the pose and information of a fit less those of its prior: Λ = P − P₀, m = x + Λ⁺ P₀ (x − x₀)."""
+    information = np.asarray(np.linalg.inv(fit.covariance[:3, :3]), np.float64)
+    if prior is None:
+        return fit.pose, information
+    of_prior = np.linalg.inv(prior[1])
+    off = fit.pose - prior[0]
+    off[2] = math.remainder(off[2], math.tau)
+    root = np.sqrt(np.diag(information))
+    values, axes = np.linalg.eigh((information - of_prior) / np.outer(root, root))
+    values, axes = values[values > 1e-6], axes[:, values > 1e-6]  # the rest is the prior's alone
+    along, across = axes / root[:, None], axes * root[:, None]
+    own = across * values @ across.T
+    return fit.pose + along / values @ along.T @ of_prior @ off, np.asarray(own, np.float64)
 
 
 def relative_pose(before: _Float, after: _Float) -> _Float:

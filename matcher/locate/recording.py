@@ -24,6 +24,8 @@ from phasemark.matcher.locate.rig import Rig
 _Float = NDArray[np.float64]
 
 _MOST_BYTES = 1 << 30
+_MOST_NUMBER = 2.0**31
+"""Of stops, robots, seconds, metres and radians."""
 _FASTEST_M_S, _FASTEST_RAD_S = 5.0, 12.0
 """Odometry that moves faster between two frames has jumped."""
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
@@ -122,11 +124,15 @@ def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
     depth = _number_array(arrays[name], path, name)
     if depth.ndim not in (4, 5):
         raise InputFileError(f"{path}: '{name}' must be (stops, frames, sensors, [rows,] columns), got {depth.shape}")
+    if not depth.size:
+        raise InputFileError(f"{path}: '{name}' must have at least one number, got {depth.shape}")
     n, frames = depth.shape[:2]
     depth = _valid(depth, arrays, path, rig)
     depth = _of_sensors(depth, arrays, path, rig)
     depth = _as_depth(depth, "range" if name == "range_m" else rig.quantity, rig)
-    time_s = np.broadcast_to(_number_array(_needed(arrays, "frame_time_s", path), path, "frame_time_s"), (n, frames))
+    times = _needed(arrays, "frame_time_s", path)
+    times = _number_array(times, path, "frame_time_s", (n, frames) if times.ndim == 2 else (frames,), True)
+    time_s = np.broadcast_to(times, (n, frames))
     backwards = np.argwhere(np.diff(time_s, axis=1) <= 0)
     if len(backwards):
         k, f = backwards[0]
@@ -134,10 +140,10 @@ def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
                              f" frame {f + 1} of stop {k}")  # fmt: skip
     moved, odometry = _odometry(arrays, path, n, frames)
     robot_key = "drone" if "drone" in arrays else "robot"
-    stop = np.asarray(arrays.get("stop", np.arange(n)), np.int64)
-    robot = np.asarray(arrays.get(robot_key, np.zeros(n)), np.int64)
-    if stop.shape != (n,) or robot.shape != (n,):
-        raise InputFileError(f"{path}: 'stop' and '{robot_key}' must have {n} numbers, one a stop")
+    stop, robot = (
+        _number_array(arrays.get(key, default), path, key, (n,), True).astype(np.int64)
+        for key, default in (("stop", np.arange(n)), (robot_key, np.zeros(n)))
+    )
     run = str(arrays["run"]) if "run" in arrays else path.stem
     recording = RigRecording(depth, np.ascontiguousarray(time_s - time_s[:, :1]), moved, odometry, stop, robot, run,
                              str(arrays["map"]) if "map" in arrays else None, robot_key)  # fmt: skip
@@ -162,24 +168,28 @@ def _needed(arrays: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArra
     return arrays[name]
 
 
-def _number_array(array: NDArray[Any], path: Path, name: str) -> _Float:
-    try:
-        return np.asarray(array, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InputFileError(f"{path}: '{name}' must be numbers, got {array.dtype}") from None
+def _number_array(
+    array: NDArray[Any], path: Path, name: str, shape: tuple[int, ...] | None = None, finite: bool = False
+) -> _Float:
+    """Return numbers of a file, refused unless they are real, of a shape, and finite."""
+    if array.dtype.kind not in "fiub":
+        raise InputFileError(f"{path}: '{name}' must be numbers, got {array.dtype}")
+    if shape is not None and array.shape != shape:
+        raise InputFileError(f"{path}: '{name}' must be {shape}, got {array.shape}")
+    numbers = np.asarray(array, dtype=np.float64)
+    if finite and not (np.abs(numbers) < _MOST_NUMBER).all():
+        raise InputFileError(f"{path}: '{name}' must be finite numbers below {_MOST_NUMBER:g}")
+    return numbers
 
 
 def _valid(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
     """Return depths with NaN where they are no measurement."""
     good = np.isfinite(depth) & (depth > 0)
     if "status" in arrays:
-        if arrays["status"].shape != depth.shape:
-            raise InputFileError(f"{path}: 'status' must be {depth.shape}, got {arrays['status'].shape}")
-        good &= np.isin(arrays["status"], rig.reduction.valid_status)
+        status = _number_array(arrays["status"], path, "status", depth.shape)
+        good &= np.isin(status, rig.reduction.valid_status)
     if "sensor_read" in arrays:
-        read = np.asarray(arrays["sensor_read"], bool)
-        if read.shape != depth.shape[:3]:
-            raise InputFileError(f"{path}: 'sensor_read' must be {depth.shape[:3]}, got {read.shape}")
+        read = _number_array(arrays["sensor_read"], path, "sensor_read", depth.shape[:3]) != 0
         good &= read.reshape(*read.shape, *(1,) * (depth.ndim - 3))
     return np.where(good, depth, np.nan)
 
@@ -187,7 +197,7 @@ def _valid(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: R
 def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
     """Return the sensors of the rig in its order, rows reduced."""
     count = depth.shape[2]
-    names = [str(name) for name in np.atleast_1d(arrays.get("sensor", rig.names))]
+    names = [str(name) for name in np.ravel(arrays.get("sensor", rig.names))]
     if len(names) != count:
         raise InputFileError(f"{path}: has {count} sensors, but {len(names)} names of sensors")
     for name in rig.names:
@@ -222,19 +232,15 @@ def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: in
     at_first = None
     names = ("odometry_x_m", "odometry_y_m", "odometry_yaw_rad")
     if names[0] in arrays:
-        at_first = np.column_stack([_number_array(_needed(arrays, name, path), path, name) for name in names])
-        if at_first.shape != (n, 3):
-            raise InputFileError(f"{path}: '{names[0]}' must have {n} numbers, one a stop")
+        columns = [_number_array(_needed(arrays, name, path), path, name, (n,), True) for name in names]
+        at_first = np.column_stack(columns)
     within = ("odo_dx_m", "odo_dy_m", "odo_dyaw_rad")
     if within[0] not in arrays:
         return np.zeros((n, frames, 3)), at_first
-    world = np.stack([_number_array(_needed(arrays, name, path), path, name) for name in within], axis=-1)
-    if world.shape != (n, frames, 3):
-        raise InputFileError(f"{path}: '{within[0]}' must be {(n, frames)}, got {world.shape[:-1]}")
+    columns = [_number_array(_needed(arrays, name, path), path, name, (n, frames), True) for name in within]
+    world = np.stack(columns, axis=-1)
     if at_first is None:
         raise InputFileError(f"{path}: '{within[0]}' needs '{names[2]}', the yaw at the first frame")
-    if not (np.isfinite(world).all() and np.isfinite(at_first).all()):
-        raise InputFileError(f"{path}: the odometry must be finite numbers")
     cos, sin = np.cos(at_first[:, 2, None]), np.sin(at_first[:, 2, None])
     x, y = cos * world[..., 0] + sin * world[..., 1], cos * world[..., 1] - sin * world[..., 0]
     return np.stack([x, y, world[..., 2]], axis=-1), at_first

@@ -111,6 +111,30 @@ class StopUnknowns(PlanModel):
     yaw_deg: _Size = 0.3
 
 
+class OdometryDrift(PlanModel):
+    """Standard deviations of a step of the odometry from one stop to the next.
+
+    Of each coordinate the root of the squares of `position_m` and of `per_m` times the way; of the heading `yaw_deg`.
+    """
+
+    per_m: _Size = 0.1
+    position_m: _Positive = 0.05
+    yaw_deg: _Positive = 1.0
+
+    def covariance(self, step: _Float) -> _Float:
+        """Return the covariance of a step x, y (m), yaw (rad) in the body's frame, (3, 3)."""
+        position = math.hypot(self.position_m, self.per_m * math.hypot(step[0], step[1]))
+        return np.diag(np.square([position, position, math.radians(self.yaw_deg)]))
+
+    def moved(self, mean: _Float, covariance: _Float, step: _Float) -> tuple[_Float, _Float]:
+        """Return mean and covariance of a pose after a step in the body's frame."""
+        cos, sin = math.cos(mean[2]), math.sin(mean[2])
+        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        by = turn @ step
+        slope = np.array([[1.0, 0.0, -by[1]], [0.0, 1.0, by[0]], [0.0, 0.0, 1.0]])
+        return mean + by, slope @ covariance @ slope.T + turn @ self.covariance(step) @ turn.T
+
+
 class Rig(PlanModel):
     """Sensors of a robot.
 
@@ -123,6 +147,7 @@ class Rig(PlanModel):
         For recordings with rows.
     noise : RangeNoise
     stop : StopUnknowns
+    odometry : OdometryDrift
 
     Examples
     --------
@@ -135,6 +160,7 @@ class Rig(PlanModel):
     reduction: Reduction = Reduction()
     noise: RangeNoise = RangeNoise()
     stop: StopUnknowns = StopUnknowns()
+    odometry: OdometryDrift = OdometryDrift()
 
     @model_validator(mode="after")
     def _is_a_rig(self) -> Self:

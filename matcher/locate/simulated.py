@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.matcher.locate.kernel_arguments import Scan
-from phasemark.matcher.locate.locator import OdometryDrift, relative_pose
+from phasemark.matcher.locate.locator import relative_pose
 from phasemark.matcher.locate.recording import RigRecording
-from phasemark.matcher.locate.rig import Rig
+from phasemark.matcher.locate.rig import OdometryDrift, Rig
 from phasemark.matcher.locate.scan_fit import StopModel
 from phasemark.matcher.locate.wall_map import WallMap
 
@@ -26,7 +26,6 @@ def simulated_recording(
     *,
     time_s: ArrayLike = (0.0,),
     moved: ArrayLike | None = None,
-    drift: OdometryDrift | None = None,
 ) -> RigRecording:
     """Draw a recording: noise, outliers and the unknowns of each stop as the rig states them.
 
@@ -41,8 +40,6 @@ def simulated_recording(
         Times of the frames of a stop.
     moved : (F, 3) array_like, optional
         How the odometry moves within each stop, in the body's frame. None: not at all.
-    drift : OdometryDrift, optional
-        By how much the odometry between stops is off.
 
     Returns
     -------
@@ -63,7 +60,7 @@ def simulated_recording(
         depth[k] = np.where((own > 0) & (seen.depth_m < noise.max_range_m), own, np.nan)
     n = len(truth)
     return RigRecording(
-        depth, np.tile(times, (n, 1)), np.tile(track, (n, 1, 1)), _odometry(truth, drift or OdometryDrift(), rng),
+        depth, np.tile(times, (n, 1)), np.tile(track, (n, 1, 1)), _odometry(truth, rig.odometry, rng),
         np.arange(n), np.zeros(n, np.int64), "simulated", None, "robot", ("",) * n,
     )  # fmt: skip
 

@@ -13,8 +13,9 @@ from scipy.linalg import solveh_banded
 from scipy.stats import chi2
 
 from phasemark import UsageError
-from phasemark.matcher.locate.locator import LocatedPose, OdometryDrift, relative_pose
+from phasemark.matcher.locate.locator import LocatedPose, Locator, relative_pose
 from phasemark.matcher.locate.recording import RigRecording
+from phasemark.matcher.locate.rig import OdometryDrift
 
 _Float = NDArray[np.float64]
 
@@ -23,32 +24,23 @@ _FALSE_ALARM = 1e-4
 _MOST_STEPS = 10
 _BAND = 5
 """Beside the diagonal, of pairs of neighbouring poses with three numbers each."""
-GYRO = OdometryDrift(per_m=0.1, position_m=0.05, yaw_rad=math.radians(0.3))
-"""Odometry between stops: position by optical flow, heading by a gyro."""
 
 
-def smoothed(
-    recording: RigRecording,
-    answers: Sequence[LocatedPose],
-    part: NDArray[np.float64] | None = None,
-    drift: OdometryDrift = GYRO,
-) -> list[LocatedPose]:
+def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: Locator) -> list[LocatedPose]:
     """Return answers joined by the odometry between the stops of each robot.
 
-    Accepted poses are measurements with their covariance; so are poses that are undetermined. A pose that disagrees
-    with the rest by χ² is left out. Stops between accepted ones get a pose too: it is accepted where the odometry
-    places it to within the tolerance of an accepted pose, or the pose itself agrees.
+    What the frames of accepted and of undetermined stops speak for are measurements. A measurement that disagrees with
+    the rest by χ² is left out. A stop that was ambiguous or explained poorly is located again with the poses around as
+    its prior. An answer is accepted if its stop takes part and its pose is determined then.
 
     Parameters
     ----------
     recording : RigRecording
         With odometry at its stops.
     answers : sequence of LocatedPose
-        Of the stops, in order.
-    part : (3, 3) float64, optional
-        Part of their covariances that all stops share, that of the map: no number of stops makes it less.
-    drift : OdometryDrift
-        Between neighbouring stops of a robot.
+        Of the stops, in order, by the locator.
+    locator : Locator
+        Its rig says how far steps of the odometry may be off.
 
     Returns
     -------
@@ -59,33 +51,51 @@ def smoothed(
     UsageError
         The recording has no odometry.
     """
-    if recording.odometry is None:
+    odometry = recording.odometry
+    if odometry is None:
         raise UsageError("smoothing needs odometry at the stops: odometry_x_m, odometry_y_m, odometry_yaw_rad")
-    found, shared = list(answers), np.zeros((3, 3)) if part is None else part
+    found, part, drift = list(answers), locator.wall_map.part, locator.rig.odometry
     for robot in np.unique(recording.robot):
         own = np.flatnonzero(recording.robot == robot)
+        steps = np.array([relative_pose(odometry[a], odometry[b]) for a, b in pairwise(own)]).reshape(-1, 3)
         used = np.array([found[k].accepted or found[k].reason == "undetermined" for k in own])
         if not used.any():
             continue
-        steps = [relative_pose(recording.odometry[a], recording.odometry[b]) for a, b in pairwise(own)]
-        chain = _Chain([found[k] for k in own], shared, np.array(steps).reshape(-1, 3), drift)
-        for k, pose, covariance, agrees in zip(own, *chain.solved(used), strict=True):
-            was = found[k]
-            accepted = was.accepted and bool(agrees)
-            reason = was.reason if accepted or not was.accepted else "poor fit"
-            found[k] = replace(
-                was, x_m=float(pose[0]), y_m=float(pose[1]), yaw_rad=math.remainder(float(pose[2]), math.tau),
-                covariance=covariance + shared, accepted=accepted, reason=reason,
-            )  # fmt: skip
+        poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
+        for k, pose, around in zip(own[~used], poses[~used], covariance[~used], strict=True):
+            if found[k].reason in ("ambiguous", "poor fit"):
+                again = locator.locate_scan(recording.scan(int(k)), (pose, around + part))
+                if again.accepted:
+                    found[k] = replace(again, key=found[k].key, note=found[k].note)
+        used |= [found[k].accepted and bool(u or answers[k].reason) for k, u in zip(own.tolist(), used, strict=True)]
+        poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
+        for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
+            found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found
+
+
+def _joined(was: LocatedPose, pose: _Float, covariance: _Float, agrees: bool, locator: Locator) -> LocatedPose:
+    """Return the answer for a stop with its pose among the others."""
+    reason = was.reason
+    if agrees:
+        reason = "" if locator.is_determined(covariance) else "undetermined"
+    elif not reason:
+        reason = "poor fit"
+    x, y, yaw = pose.tolist()
+    return replace(
+        was, x_m=x, y_m=y, yaw_rad=math.remainder(yaw, math.tau), covariance=covariance, accepted=not reason,
+        reason=reason,
+    )  # fmt: skip
 
 
 class _Chain:
     """Poses of one robot's stops, and the steps between them."""
 
-    def __init__(self, answers: Sequence[LocatedPose], shared: _Float, steps: _Float, drift: OdometryDrift) -> None:
-        self.measured = np.array([one.pose for one in answers])
-        self.covariance = np.array([one.covariance for one in answers]) - shared
+    def __init__(self, answers: Sequence[LocatedPose], steps: _Float, drift: OdometryDrift) -> None:
+        nothing = (np.zeros(3), np.zeros((3, 3)))
+        evidence = [one.evidence or nothing for one in answers]
+        self.measured = np.array([pose for pose, _ in evidence])
+        self.weight = np.array([information for _, information in evidence])
         self.steps = steps
         self.precision = np.array([np.linalg.inv(drift.covariance(step)) for step in steps]).reshape(-1, 3, 3)
 
@@ -95,13 +105,14 @@ class _Chain:
         limit = float(chi2.isf(_FALSE_ALARM, 3))
         while True:
             poses, covariance = self._fitted(used)
-            off = self.measured - poses
-            off[:, 2] = (off[:, 2] + math.pi) % math.tau - math.pi
-            # of a measurement that takes part, the covariance of its residual is its own less that of the fit
-            spread = np.where(used[:, None, None], self.covariance - covariance, 1.0)
-            spread = np.where(np.isfinite(spread), spread, 0.0) + 1e-12 * np.eye(3)
-            distance = np.einsum("ki,ki->k", off, np.linalg.solve(spread, off[..., None])[..., 0])
-            distance[~used] = -np.inf
+            distance = np.full(len(used), -np.inf)
+            for k in np.flatnonzero(used):
+                off = self.measured[k] - poses[k]
+                off[2] = math.remainder(off[2], math.tau)
+                # the covariance of a residual is that of the measurement less that of the fit: Λ⁻¹ − C
+                pulled = self.weight[k] @ off
+                spread = self.weight[k] - self.weight[k] @ covariance[k] @ self.weight[k]
+                distance[k] = pulled @ np.linalg.pinv(spread, rcond=1e-6, hermitian=True) @ pulled
             worst = int(np.argmax(distance))
             if distance[worst] <= limit or used.sum() < 3:
                 return poses, covariance, used
@@ -111,7 +122,6 @@ class _Chain:
         """Return the least-squares poses, (n, 3), and their covariances, (n, 3, 3)."""
         n = len(self.measured)
         poses = self._started(used)
-        weight = [np.linalg.inv(c) if u else np.zeros((3, 3)) for c, u in zip(self.covariance, used, strict=True)]
         for _ in range(_MOST_STEPS):
             normal, pull = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
             for k in range(n):
@@ -119,12 +129,12 @@ class _Chain:
                 if used[k]:
                     off = self.measured[k] - poses[k]
                     off[2] = math.remainder(off[2], math.tau)
-                    normal[own, own] += weight[k]
-                    pull[own] += weight[k] @ off
+                    normal[own, own] += self.weight[k]
+                    pull[own] += self.weight[k] @ off
                 if k + 1 < n:
                     self._join(poses, k, normal, pull)
             banded = np.zeros((_BAND + 1, 3 * n))
-            for below in range(_BAND + 1):
+            for below in range(min(_BAND + 1, 3 * n)):
                 banded[below, : 3 * n - below] = np.diagonal(normal, -below)
             step = solveh_banded(banded, np.column_stack([pull, np.eye(3 * n)]), lower=True)
             poses = poses + step[:, 0].reshape(n, 3)

@@ -225,7 +225,7 @@ class WallMap(PlanModel):
         if not len(pieces):
             raise UsageError(f"'height_m' must be a height at which the map has walls or bodies, got {self.height_m:g}")
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
-        pieces, of = _cut(pieces)
+        pieces, of = cut_at_crossings(pieces)
         return Outline(pieces, owner[of], np.array(normals), np.array(stds))
 
     def with_walls_moved(self, displacement_m: _Float) -> Self:
@@ -323,8 +323,20 @@ def _cross(one: _Float, other: _Float) -> bool:
     return bool(a < own[0] < 1 - a and b < theirs[0] < 1 - b)
 
 
-def _cut(pieces: _Float) -> tuple[_Float, NDArray[np.int64]]:
-    """Cut segments where they meet others: return the parts (m, 4), and which segment each is of."""
+def cut_at_crossings(pieces: _Float) -> tuple[_Float, NDArray[np.int64]]:
+    """Cut segments where they meet others.
+
+    Parameters
+    ----------
+    pieces : (k, 4) float64
+        Ends x, y, x, y.
+
+    Returns
+    -------
+    parts : (m, 4) float64
+    of : (m,) int64
+        Which segment each part is of.
+    """
     parts, of = [], []
     for k, piece in enumerate(pieces):
         own, theirs = _crossings(piece, pieces)
