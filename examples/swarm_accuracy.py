@@ -172,12 +172,14 @@ def rows() -> Iterator[tuple[str, Row]]:
         ),
     )
     yield "no start", lambda run, rig: (rig, Locator(run.wall_map, rig).locate(run.recording))
+    yield "no start, smoothed", lambda run, rig: (rig, joined(run, rig, anywhere=True))
 
 
-def joined(run: Run, rig: Rig) -> list[LocatedPose]:
-    """Follow the odometry, and join all stops by it."""
+def joined(run: Run, rig: Rig, anywhere: bool = False) -> list[LocatedPose]:
+    """Follow the odometry, or search the whole map at each stop, and join all stops by the odometry."""
     locator = Locator(run.wall_map, rig)
-    return smoothed(run.recording, locator.follow(run.recording), locator)
+    answers = locator.locate(run.recording) if anywhere else locator.follow(run.recording)
+    return smoothed(run.recording, answers, locator)
 
 
 def first_frame(run: Run) -> Run:

@@ -104,8 +104,9 @@ def test_poses_of_random_rooms_have_the_covariance_that_is_stated():
 
 @pytest.mark.soak
 def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated():
-    nees, wrong, _, _ = trials(maps=20, stops=250, seed=6)
+    nees, wrong, accepted, n = trials(maps=20, stops=250, seed=6)
     assert wrong == 0
+    assert accepted > 0.7 * n
     assert 0.95 < nees.mean() / 3 < 1.05  # N = 5000 less what is undetermined: 0.012 is one standard deviation
 
 
@@ -128,6 +129,17 @@ def trials(maps, stops, seed):
                 beyond = (np.abs(off) > [0.1, 0.1, math.radians(5)]).any()
                 wrong += bool(beyond and nees[-1] > chi2.isf(1e-5, 3))  # 3 standard deviations may be the tolerance
     return np.array(nees), wrong, len(nees), maps * stops
+
+
+def test_unknowns_that_are_left_out_leave_the_pose_free():
+    one, nothing = room(wall=[POST]), {"drift_m_s": 0.0, "age_s": 0.0, "offset_m": 0.0, "yaw_deg": 0.0}
+    rig, pose = ring_rig(4, stop=nothing), np.array([[1.0, 0.8, 0.4]])
+    recording = simulated_recording(one, rig, pose, np.random.default_rng(3))
+    answer = Locator(one, rig).locate(recording, pose + 0.1, (0.2, 0.2, 0.2))[0]
+    off = answer.pose - pose[0]
+    assert answer.accepted
+    assert 0 < off @ np.linalg.solve(answer.covariance, off) < 16.3  # 99.9 % of χ² with 3 degrees of freedom
+    assert np.sqrt(answer.covariance[0, 0]) < 8e-3  # of a dozen columns along x, 12 to 20 mm each
 
 
 def test_a_square_room_is_ambiguous_and_all_four_poses_are_listed():

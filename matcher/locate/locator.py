@@ -16,7 +16,7 @@ from phasemark.matcher.locate.kernel_arguments import Scan
 from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
-from phasemark.matcher.locate.scan_fit import StopFit, StopModel, fit_stop
+from phasemark.matcher.locate.scan_fit import StopFit, StopModel, fit_stop, std_without_one
 from phasemark.matcher.locate.wall_map import WallMap
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
@@ -270,7 +270,7 @@ class Locator:
         fits = self._fits(scan, prior)
         if not fits:
             return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
-        return self._answer(fits, len(scan.time_s), prior)
+        return self._answer(scan, fits, prior)
 
     def _fits(self, scan: Scan, prior: tuple[_Float, _Float] | None) -> list[StopFit]:
         """Return distinct fits, best first: descents on three frames from a grid, then on all frames."""
@@ -302,18 +302,18 @@ class Locator:
                 kept.append(fit)
         return kept
 
-    def is_determined(self, covariance: _Float) -> bool:
-        """Return whether three standard deviations of a pose are within the tolerance."""
-        return bool((TOLERATED_SIGMA * np.sqrt(np.diag(covariance)) <= self._tolerance).all())
+    def is_determined(self, std: _Float) -> bool:
+        """Return whether three standard deviations of a pose, (3,), are within the tolerance."""
+        return bool((TOLERATED_SIGMA * std <= self._tolerance).all())
 
     @property
     def _tolerance(self) -> _Float:
         return np.array([self.tolerance_m, self.tolerance_m, self.tolerance_rad])
 
-    def _answer(self, fits: list[StopFit], frames: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
+    def _answer(self, scan: Scan, fits: list[StopFit], prior: tuple[_Float, _Float] | None) -> LocatedPose:
         """Return the best fit as the answer, or the reason to refuse it, with what explains the stop nearly as well."""
         best = fits[0]
-        opinions = max(1.0, frames / _SAME_FRAMES)
+        opinions = max(1.0, len(scan.time_s) / _SAME_FRAMES)
         excess = np.array([fit.cost - best.cost for fit in fits]) / opinions
         near = [k for k in range(len(fits)) if excess[k] < DISAGREEMENT and fits[k].share >= self.least_explained]
         weight = np.exp(-0.5 * excess)
@@ -324,7 +324,9 @@ class Locator:
             candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
-        reason = self._reason(fits, near, covariance)
+        reason = self._reason(
+            fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(self.model, scan, best) ** 2)
+        )
         return LocatedPose(
             ("", 0, 0),
             x,
@@ -339,14 +341,17 @@ class Locator:
             evidence=_without(best, prior),
         )
 
-    def _reason(self, fits: list[StopFit], near: list[int], covariance: _Float) -> LocateReason:
+    def _reason(self, fits: list[StopFit], near: list[int], std: _Float) -> LocateReason:
         """Return why the best fit is refused; empty where it is accepted."""
         if fits[0].share < self.least_explained:
             return "poor fit"
-        if not self.is_determined(covariance):
+        if not self.is_determined(std):
             return "undetermined"
-        others = (apart(fits[k].pose, fits[0].pose) for k in near[1:])
-        return "ambiguous" if any((off > self._tolerance).any() for off in others) else ""
+        for other in (fits[k] for k in near[1:]):  # the truth may be on the far side of another pose
+            off = apart(other.pose, fits[0].pose) + TOLERATED_SIGMA * np.sqrt(np.diag(other.covariance)[:3])
+            if (off > self._tolerance).any():
+                return "ambiguous"
+        return ""
 
 
 def _without(fit: StopFit, prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float]:

@@ -20,6 +20,8 @@ _TOLERANCE_M = 0.25
 """A column that is farther off than this counts as one that is not explained: half a cell at 3 m is 0.15 m off."""
 _WORSE = 0.25
 """Part of the columns by which a pose may explain fewer than the best one, at nodes of the grid."""
+_FEWEST = 8
+"""Local minima that are kept however bad: few columns tell little at nodes of a grid."""
 _MOST_NODES = 200_000
 
 
@@ -83,7 +85,8 @@ def promising_poses(
     _score(grid.range_m, nodes, np.asarray(yaw[turns], np.float64), direction, depth, cosine, before, score)
     volume = score.reshape(len(x_near), len(y_near), len(turns))
     best = _local_minima(volume, closed=len(turns) == _TURNS)[:most]
-    best = best[volume.ravel()[best] <= volume.min() + _WORSE * len(depth)]
+    limit = volume.min() + _WORSE * len(depth)
+    best = best[(volume.ravel()[best] <= limit) | (np.arange(len(best)) < _FEWEST)]
     i, j, k = np.unravel_index(best, volume.shape)
     return np.column_stack([x[x_near[i]], y[y_near[j]], yaw[turns[k]]])
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.estimate.solver import descend
 from phasemark.matcher.locate.kernel_arguments import Outline, Prediction, RigNumbers, Scan
 from phasemark.matcher.locate.rig import Rig
-from phasemark.matcher.locate.scan_rows import N_BODY, empty_prediction, predict, sums
+from phasemark.matcher.locate.scan_rows import N_BODY, SENSOR_YAW, empty_prediction, predict, sums
 
 _Float = NDArray[np.float64]
 
@@ -48,9 +48,8 @@ class StopModel:
 
     @property
     def longest(self) -> _Float:
-        """Longest steps of the unknowns of a stop, (6 + 2 S,)."""
-        sensors = len(self.rig.sensor)
-        return np.array([0.15, 0.15, 0.15, 0.05, 0.05, 0.03] + [0.03] * sensors + [0.02] * sensors)
+        """Longest steps of the unknowns of a stop, (6 + 2 S,): of the pose, and some standard deviations of others."""
+        return np.concatenate([[0.15, 0.15, 0.15], 5 * self.unknowns_std])
 
     @property
     def unknowns_std(self) -> _Float:
@@ -194,6 +193,31 @@ def fit_stop(
         if k + 1 >= len(widths) and float(moved @ point.information @ moved) < 10 * _DONE:
             break
     return _as_fit(_Point.at(model, scan, theta, (mean, precision), None, widths[-1]), bool(prior))
+
+
+def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
+    """Return the largest standard deviations of the pose after the frames of any one column are left out, (3,).
+
+    A column at the end of a wall may claim more than it knows, so an answer is judged by these.
+    """
+    seen, sensors = model.prediction(fit.theta, scan), scan.depth_m.shape[1]
+    sigma = model.sigma_m(seen)
+    with np.errstate(over="ignore"):
+        likely = np.exp(-0.5 * ((scan.depth_m - seen.depth_m) / sigma) ** 2)
+    scale = np.sqrt(likely / (likely + model.outlier_density * sigma * math.sqrt(2 * math.pi))) / sigma
+    information = np.linalg.inv(fit.covariance)
+    reduced = []
+    for s, c in np.ndindex(scan.depth_m.shape[1:]):
+        used = np.isfinite(scale[:, s, c])
+        rows = np.zeros((np.count_nonzero(used), len(fit.theta)))
+        rows[:, :N_BODY] = seen.slope[used, s, c, :N_BODY]
+        rows[:, N_BODY + s], rows[:, N_BODY + sensors + s] = 1.0, seen.slope[used, s, c, SENSOR_YAW]
+        rows *= scale[used, s, c, None]
+        reduced.append(information - rows.T @ rows)
+    root = np.sqrt(np.diag(information))
+    ridge = 1e-9 * np.eye(len(root))  # what one column alone tells has no standard deviation without it
+    covariance = np.linalg.inv(np.array(reduced) / np.outer(root, root) + ridge)
+    return np.asarray(np.sqrt(np.abs(np.einsum("kpp->kp", covariance)[:, :3]).max(axis=0)) / root[:3])
 
 
 def _as_fit(point: _Point, with_prior: bool) -> StopFit:

@@ -78,7 +78,7 @@ def _joined(was: LocatedPose, pose: _Float, covariance: _Float, agrees: bool, lo
     """Return the answer for a stop with its pose among the others."""
     reason = was.reason
     if agrees:
-        reason = "" if locator.is_determined(covariance) else "undetermined"
+        reason = "" if locator.is_determined(np.sqrt(np.diag(covariance))) else "undetermined"
     elif not reason:
         reason = "poor fit"
     x, y, yaw = pose.tolist()
