@@ -17,8 +17,6 @@ from phasemark.matcher import Match, RobotPose, robot_poses
 from phasemark.matcher.drive import (
     OUTPUTS,
     DrivePlan,
-    OdometryPlan,
-    PoseFilter,
     RobotEquipment,
     default_drive,
     example_drive,
@@ -28,11 +26,14 @@ from phasemark.matcher.drive import (
     run_drive,
     stops_csv,
 )
-from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
-from phasemark.matcher.drive.odometry import OdometryModel, Reading, World, motion_jacobian, motion_noise, moved
+from phasemark.matcher.drive.follow import Path, pan_towards
+from phasemark.matcher.drive.odometry import World
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.position import Placement
+from phasemark.matcher.sequence import OdometryModel, OdometryPlan, PoseFilter, Reading
+from phasemark.matcher.sequence.odometry import motion_jacobian, motion_noise, moved
+from phasemark.matcher.sequence.planar import lens_pose, view_of
 from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 

@@ -10,14 +10,12 @@ if TYPE_CHECKING:
     from phasemark.matcher.drive.plan import (
         CameraPlan,
         DrivePlan,
-        OdometryPlan,
         PathPlan,
         StopPlan,
         default_drive,
         example_drive,
         read_drive_plan,
     )
-    from phasemark.matcher.drive.pose_filter import PoseFilter
     from phasemark.matcher.drive.simulate import Drive, RobotEquipment, Stop, pose_error, run_drive
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
@@ -27,9 +25,7 @@ __all__ = [
     "CameraPlan",
     "Drive",
     "DrivePlan",
-    "OdometryPlan",
     "PathPlan",
-    "PoseFilter",
     "RobotEquipment",
     "Stop",
     "StopPlan",

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from phasemark.landmarks import catalog
-from phasemark.matcher.drive.follow import rotation
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
+from phasemark.matcher.sequence.planar import rotation
 from phasemark.render.charts import explain
 
 _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"

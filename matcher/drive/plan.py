@@ -16,6 +16,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel, read_plan
 from phasemark.matcher.position.landmark_map import LandmarkMap, Point, Std, read_landmark_map
+from phasemark.matcher.sequence.odometry import OdometryPlan
 from phasemark.render import Sensor, preset
 
 _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -64,36 +65,6 @@ class PathPlan(PlanModel):
     def start_covariance(self) -> NDArray[np.float64]:
         """Of (x, y, heading), (3, 3)."""
         return np.diag(np.square([self.start_std_m, self.start_std_m, math.radians(self.start_std_deg)]))
-
-
-class OdometryPlan(PlanModel):
-    """Errors of wheels and gyro; the filter is given these standard deviations, not the errors.
-
-    Parameters
-    ----------
-    slip_std : float
-        Standard deviation of the slip, the share of the way by which the wheels turn in vain; drawn once for a drive.
-    slip_walk_per_sqrt_m : float
-        Random walk of the slip, for each √m of way.
-    along_m_per_sqrt_m : float
-        Random error of the way driven, forward: metres for each √m.
-    across_m_per_sqrt_m : float
-        Random error of the way driven, sideways: metres for each √m.
-    gyro_bias_std_deg_s : float
-        Standard deviation of the gyro's bias at the start, degrees a second.
-    gyro_bias_walk_deg_s_per_sqrt_s : float
-        Random walk of the gyro's bias, degrees a second for each √s.
-    gyro_noise_deg_per_sqrt_s : float
-        Angle random walk of the gyro, degrees for each √s.
-    """
-
-    slip_std: Std = 0.03
-    slip_walk_per_sqrt_m: Std = 0.003
-    along_m_per_sqrt_m: Std = 0.004
-    across_m_per_sqrt_m: Std = 0.004
-    gyro_bias_std_deg_s: Std = 0.2
-    gyro_bias_walk_deg_s_per_sqrt_s: Std = 0.005
-    gyro_noise_deg_per_sqrt_s: Std = 0.1
 
 
 class CameraPlan(PlanModel):

@@ -16,14 +16,16 @@ from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
-from phasemark.matcher.drive.follow import Path, lens_pose, pan_towards, view_of
-from phasemark.matcher.drive.odometry import OdometryModel, World, moved
+from phasemark.matcher.drive.follow import Path, pan_towards
+from phasemark.matcher.drive.odometry import World
 from phasemark.matcher.drive.plan import DrivePlan
-from phasemark.matcher.drive.pose_filter import PoseFilter
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark
+from phasemark.matcher.sequence.odometry import OdometryModel, moved
+from phasemark.matcher.sequence.planar import lens_pose, view_of
+from phasemark.matcher.sequence.pose_filter import PoseFilter
 from phasemark.matcher.statistics import nees
 from phasemark.render import Background, Renderer, Sensor, Views, capture
 

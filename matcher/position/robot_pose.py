@@ -213,7 +213,7 @@ def robot_poses(
         pose = np.array([*(lens - to_pan - to_lens), _wrap(heading)])
         covariance = None
         if of_view is not None:
-            jacobian = _jacobian(match.distance_m, towards, heading, camera_heading, to_pan, to_lens)
+            jacobian = pose_jacobian(match.distance_m, towards, heading, camera_heading, to_pan, to_lens)
             both = np.zeros((len(jacobian.T), len(jacobian.T)))
             both[:3, :3], both[3:, 3:] = of_view, others
             covariance = jacobian @ both @ jacobian.T
@@ -236,7 +236,7 @@ def robot_poses(
     return poses if believed is None else sorted(poses, key=lambda pose: pose.mahalanobis)
 
 
-def _jacobian(
+def pose_jacobian(
     distance_m: float,
     towards: NDArray[np.float64],
     heading_rad: float,

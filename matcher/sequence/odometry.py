@@ -1,0 +1,165 @@
+"""Odometry of wheels that slip and a gyro that drifts, and its errors."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.data.plans.bank_plan import PlanModel
+from phasemark.matcher.position.landmark_map import Std
+from phasemark.matcher.sequence.planar import rotation
+
+STATE = ("x_m", "y_m", "heading_rad", "slip", "gyro_bias_rad_s")
+"""What the filter estimates: the pose, and the two errors that last."""
+
+
+class OdometryPlan(PlanModel):
+    """Errors of wheels and gyro; the filter is given these standard deviations, not the errors.
+
+    Parameters
+    ----------
+    slip_std : float
+        Standard deviation of the slip, the share of the way by which the wheels turn in vain; drawn once for a drive.
+    slip_walk_per_sqrt_m : float
+        Random walk of the slip, for each √m of way.
+    along_m_per_sqrt_m : float
+        Random error of the way driven, forward: metres for each √m.
+    across_m_per_sqrt_m : float
+        Random error of the way driven, sideways: metres for each √m.
+    gyro_bias_std_deg_s : float
+        Standard deviation of the gyro's bias at the start, degrees a second.
+    gyro_bias_walk_deg_s_per_sqrt_s : float
+        Random walk of the gyro's bias, degrees a second for each √s.
+    gyro_noise_deg_per_sqrt_s : float
+        Angle random walk of the gyro, degrees for each √s.
+    """
+
+    slip_std: Std = 0.03
+    slip_walk_per_sqrt_m: Std = 0.003
+    along_m_per_sqrt_m: Std = 0.004
+    across_m_per_sqrt_m: Std = 0.004
+    gyro_bias_std_deg_s: Std = 0.2
+    gyro_bias_walk_deg_s_per_sqrt_s: Std = 0.005
+    gyro_noise_deg_per_sqrt_s: Std = 0.1
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Odometry of one step.
+
+    Parameters
+    ----------
+    way_m : float
+        From the wheel encoders.
+    turn_rad : float
+        From the gyro.
+    time_s : float
+    """
+
+    way_m: float
+    turn_rad: float
+    time_s: float
+
+
+@dataclass(frozen=True)
+class OdometryModel:
+    """The standard deviations of an :class:`OdometryPlan`, radians.
+
+    Parameters
+    ----------
+    slip_std, slip_walk, along, across : float
+        Walk and errors of the way per √m.
+    bias_std_rad_s, bias_walk, turn : float
+        Walk and angle random walk per √s.
+    """
+
+    slip_std: float
+    slip_walk: float
+    along: float
+    across: float
+    bias_std_rad_s: float
+    bias_walk: float
+    turn: float
+
+    @classmethod
+    def of(cls, plan: OdometryPlan) -> OdometryModel:
+        """Take the figures of a plan."""
+        return cls(
+            slip_std=plan.slip_std,
+            slip_walk=plan.slip_walk_per_sqrt_m,
+            along=plan.along_m_per_sqrt_m,
+            across=plan.across_m_per_sqrt_m,
+            bias_std_rad_s=math.radians(plan.gyro_bias_std_deg_s),
+            bias_walk=math.radians(plan.gyro_bias_walk_deg_s_per_sqrt_s),
+            turn=math.radians(plan.gyro_noise_deg_per_sqrt_s),
+        )
+
+    def start(self, pose_covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the covariance of the whole state at the start, (5, 5)."""
+        covariance = np.zeros((5, 5))
+        covariance[:3, :3] = pose_covariance
+        covariance[3, 3], covariance[4, 4] = self.slip_std**2, self.bias_std_rad_s**2
+        return covariance
+
+    def step(
+        self, state: NDArray[np.float64], reading: Reading
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the state after a step, (5,), its Jacobian by the state before, and the covariance that is added."""
+        return moved(state, reading), motion_jacobian(state, reading), motion_noise(state, reading, self)
+
+    def stand(self, covariance: NDArray[np.float64], time_s: float) -> None:
+        """Advance time at rest, in place: the pose stays, the variance of the bias grows."""
+        covariance[4, 4] += self.bias_walk**2 * time_s
+
+
+def moved(state: NDArray[np.float64], reading: Reading) -> NDArray[np.float64]:
+    """Return the state after a step: way and turn less what slip and bias add to them, along an arc's chord.
+
+    Parameters
+    ----------
+    state : (5,) float64
+        In the order of :data:`STATE`.
+    reading : Reading
+    """
+    turn = reading.turn_rad - state[4] * reading.time_s
+    way = (1 - state[3]) * reading.way_m
+    middle = state[2] + turn / 2
+    after = state.copy()
+    after[0] += way * math.cos(middle)
+    after[1] += way * math.sin(middle)
+    after[2] = math.remainder(state[2] + turn, math.tau)
+    return after
+
+
+def motion_jacobian(state: NDArray[np.float64], reading: Reading) -> NDArray[np.float64]:
+    """Return ∂ moved / ∂ state, (5, 5)."""
+    middle = state[2] + (reading.turn_rad - state[4] * reading.time_s) / 2
+    cos, sin = math.cos(middle), math.sin(middle)
+    way = (1 - state[3]) * reading.way_m
+    jacobian = np.eye(5)
+    jacobian[:2, 2] = -way * sin, way * cos
+    jacobian[:2, 3] = -reading.way_m * cos, -reading.way_m * sin
+    jacobian[:2, 4] = jacobian[:2, 2] * (-reading.time_s / 2)
+    jacobian[2, 4] = -reading.time_s
+    return jacobian
+
+
+def motion_noise(state: NDArray[np.float64], reading: Reading, model: OdometryModel) -> NDArray[np.float64]:
+    """Return the covariance that a step adds, (5, 5).
+
+    Parameters
+    ----------
+    state : (5,) float64
+    reading : Reading
+    model : OdometryModel
+    """
+    way = abs(reading.way_m)
+    axes = rotation(state[2])
+    noise = np.zeros((5, 5))
+    noise[:2, :2] = axes @ np.diag([model.along**2 * way, model.across**2 * way]) @ axes.T
+    noise[2, 2] = model.turn**2 * reading.time_s
+    noise[3, 3], noise[4, 4] = model.slip_walk**2 * way, model.bias_walk**2 * reading.time_s
+    return noise

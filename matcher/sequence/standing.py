@@ -1,0 +1,136 @@
+"""A landmark in its place, and the poses that a match of it allows."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.match import Match
+from phasemark.matcher.position.robot_pose import RobotPose, pose_jacobian, robot_poses
+from phasemark.matcher.sequence.planar import lens_pose, rotation, view_of
+from phasemark.matcher.sequence.pose_filter import Sighting
+
+_VIEW = ("distance_m", "delta_rad", "bearing_rad")
+_SHARED = ("calibration", "recording", "declared")
+"""Parts of a match's covariance that are the same error in all frames of a recording."""
+_LEAST_SHARE, _MOST_RIVALS = 1e-3, 4
+"""Least probability of a rival of an ambiguous match, which one frame cannot exclude, and how many rivals are kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """Place of a landmark, and of the camera on the robot (PHYSICS section 8).
+
+    Parameters
+    ----------
+    landmark_xy_m : (x, y)
+    landmark_yaw_rad : float
+    pan_rad : float
+    pan_offset_xy_m, lens_offset_xy_m : (x, y)
+        As :func:`~phasemark.matcher.robot_poses` has them.
+    flat : bool
+        Whether the landmark is a wide plane across the x axis, which does not show where along it the camera stands:
+        x and the heading are then all that is measured.
+    """
+
+    landmark_xy_m: tuple[float, float] = (0.0, 0.0)
+    landmark_yaw_rad: float = 0.0
+    pan_rad: float = 0.0
+    pan_offset_xy_m: tuple[float, float] = (0.0, 0.0)
+    lens_offset_xy_m: tuple[float, float] = (0.0, 0.0)
+    flat: bool = False
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Which of x, y and heading are measured."""
+        return (0, 2) if self.flat else (0, 1, 2)
+
+    def view(self, pose: NDArray[np.float64]) -> tuple[float, float, float]:
+        """Return (D, δ, b) of the landmark seen from a pose of the robot, (x, y, heading)."""
+        lens = lens_pose(pose, self.pan_rad, self.pan_offset_xy_m, self.lens_offset_xy_m)
+        return view_of(lens, self.landmark_xy_m, self.landmark_yaw_rad)
+
+    def sightings(self, match: Match, about: NDArray[np.float64] | None = None) -> list[Sighting]:
+        """Return the poses that a match allows: of each symmetric side, and of the rivals of an ambiguous one.
+
+        Parameters
+        ----------
+        match : Match
+            With a covariance.
+        about : (3,) float64, optional
+            Pose at which an undetermined match is linear: its covariance is too wide for the curve that it lies along.
+        """
+        if about is not None and match.reason == "undetermined":
+            return [self._about(match, about)]
+        found = []
+        for one, share in _explanations(match):
+            for pose in self._poses(one):
+                at = np.array([pose.x_m, pose.y_m, pose.heading_rad])
+                found.append(self._sighting(one, pose, at, math.log(share / match.symmetry)))
+        return found
+
+    def _about(self, match: Match, about: NDArray[np.float64]) -> Sighting:
+        """Return what a match measures, to first order about a pose; of its symmetric sides the nearest."""
+        view = self.view(about)
+        change = np.array([getattr(match, name) for name in _VIEW]) - view
+        change[1] = math.remainder(change[1], math.tau / match.symmetry)
+        change[2] = math.remainder(change[2], math.tau)
+        there = replace(match, distance_m=view[0], delta_rad=view[1], bearing_rad=view[2], symmetry=1)
+        (pose,) = self._poses(there)
+        at = about + self._jacobian(there, pose) @ change
+        return self._sighting(there, pose, at, 0.0)
+
+    def _poses(self, match: Match) -> list[RobotPose]:
+        """Return the poses of the robot with the covariance of the noise alone."""
+        assert match.covariance is not None
+        own = match.covariance - sum(match.systematic.get(name, 0.0) for name in _SHARED)
+        return robot_poses(
+            replace(match, covariance=(own + own.T) / 2),
+            self.landmark_xy_m,
+            self.landmark_yaw_rad,
+            self.pan_rad,
+            pan_offset_xy_m=self.pan_offset_xy_m,
+            lens_offset_xy_m=self.lens_offset_xy_m,
+        )
+
+    def _jacobian(self, match: Match, pose: RobotPose) -> NDArray[np.float64]:
+        """Return ∂ pose / ∂ (D, δ, b), (3, 3)."""
+        towards = rotation(pose.camera_heading_rad + match.bearing_rad)[:, 0]
+        to_pan = rotation(pose.heading_rad) @ self.pan_offset_xy_m
+        to_lens = rotation(pose.camera_heading_rad) @ self.lens_offset_xy_m
+        whole = pose_jacobian(
+            match.distance_m, towards, pose.heading_rad, pose.camera_heading_rad, to_pan, to_lens
+        )  # fmt: skip
+        return whole[:, :3]
+
+    def _sighting(self, match: Match, pose: RobotPose, at: NDArray[np.float64], log_share: float) -> Sighting:
+        assert pose.covariance is not None
+        shared = np.zeros((3, 3))
+        places = [(k, _VIEW.index(name)) for k, name in enumerate(match.free) if name in _VIEW]
+        own, into = np.array(places).T
+        for name in _SHARED:
+            if name in match.systematic:
+                shared[np.ix_(into, into)] += match.systematic[name][np.ix_(own, own)]
+        values, vectors = np.linalg.eigh(shared)
+        # the symmetric root changes with the view as little as the covariance does
+        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
+        return Sighting(at, pose.covariance, self._jacobian(match, pose) @ root, self.rows, log_share)
+
+
+def _explanations(match: Match) -> Iterator[tuple[Match, float]]:
+    """Yield a match with its probability, and if it is ambiguous the other views of its class with theirs."""
+    rivals = [other for other in match.alternatives if other.class_name == match.class_name][:_MOST_RIVALS]
+    if match.reason != "ambiguous" or not rivals:
+        yield match, 1.0
+        return
+    shares = [max(1 - sum(other.weight for other in match.alternatives), _LEAST_SHARE)]
+    shares += [max(other.weight, _LEAST_SHARE) for other in rivals]
+    total = sum(shares)
+    yield match, shares[0] / total
+    for other, share in zip(rivals, shares[1:], strict=True):
+        names = (*_VIEW, "height_m", "pitch_rad", "roll_rad")
+        yield replace(match, **{name: getattr(other, name) for name in names}), share / total

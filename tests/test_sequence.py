@@ -1,0 +1,164 @@
+"""A pose over time: against batch least squares, simulated drives with known truth, rivals, outliers and loss."""
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from phasemark.matcher import Match
+from phasemark.matcher.match import Candidate
+from phasemark.matcher.sequence import FreeMotion, PoseEstimator, PoseFilter, Reading, Sighting, Standing
+from phasemark.matcher.statistics import nees
+
+FREE = ("distance_m", "delta_rad", "bearing_rad")
+NOISE = np.diag(np.square([0.004, math.radians(0.8), math.radians(0.3)]))
+SHARED = np.diag(np.square([0.005, math.radians(0.8), math.radians(0.3)]))
+STEP_S = 1 / 15
+
+
+def match_of(view: Any, noise: Any = NOISE, *, reason: Any = "", shared: Any = SHARED, **fields: Any) -> Match:
+    parts = {} if shared is None else {"recording": shared}
+    whole = noise if shared is None else noise + shared
+    return Match("a", not reason, *view, free=FREE, covariance=whole, systematic=parts, reason=reason, **fields)
+
+
+def wander(rng: np.random.Generator, n: int, motion: FreeMotion) -> np.ndarray:
+    """Poses that move as the model says, away from the landmark's axis."""
+    state = np.array([-1.0, 0.1, 0.05, 0.0, 0.0, 0.0])
+    found = np.empty((n, 3))
+    for k in range(n):
+        state, _, noise = motion.step(state, Reading(0.0, 0.0, STEP_S))
+        state = state + rng.multivariate_normal(np.zeros(6), noise)
+        found[k] = state[:3]
+    return found
+
+
+def test_filter_and_smoother_are_batch_least_squares():
+    """Sightings along a line with a bias that all share: a linear problem, whose normal equations are the oracle."""
+    rng, motion, n = np.random.default_rng(1), FreeMotion(0.3, 0.4, 0.5, 0.6), 8
+    covariance, loading, start = np.diag([1e-4, 4e-4, 2e-4]), np.diag([0.02, 0.01, 0.015]), np.eye(3) * 0.04
+    robot = PoseFilter(np.zeros(3), start, motion, 1 - 1e-12, shares_errors=True)
+    measured = rng.normal(0, 0.05, (n, 3))
+    _, jacobian, noise = motion.step(np.zeros(6), Reading(0.0, 0.0, STEP_S))
+    size = 6 * n + 3
+    information, right = np.zeros((size, size)), np.zeros(size)
+    first = motion.start(start)
+    prior = jacobian @ first @ jacobian.T + noise
+    for k in range(n):
+        robot.predict(Reading(0.0, 0.0, STEP_S))
+        robot.take(Sighting(measured[k], covariance, loading))
+        robot.mark()
+        own = slice(6 * k, 6 * k + 6)
+        rows = np.zeros((6, size))
+        rows[:, own] = np.eye(6)
+        if k:
+            rows[:, 6 * k - 6 : 6 * k] = -jacobian
+        weight = np.linalg.inv(noise if k else prior)
+        information += rows.T @ weight @ rows
+        seen = np.zeros((3, size))
+        seen[:, 6 * k : 6 * k + 3], seen[:, -3:] = np.eye(3), loading
+        information += seen.T @ np.linalg.inv(covariance) @ seen
+        right += seen.T @ np.linalg.inv(covariance) @ measured[k]
+    information[-3:, -3:] += np.eye(3)
+    best, whole = np.linalg.solve(information, right), np.linalg.inv(information)
+    for k, (state, spread) in enumerate(robot.smoothed()):
+        own = [*range(6 * k, 6 * k + 6), *range(size - 3, size)]
+        np.testing.assert_allclose(state, best[own], atol=1e-10)
+        np.testing.assert_allclose(spread, whole[np.ix_(own, own)], atol=1e-10)
+    np.testing.assert_allclose(robot.pose, best[size - 9 : size - 6], atol=1e-10)
+
+
+def test_poses_of_simulated_drives_are_as_uncertain_as_stated():
+    """A bias of each recording, undetermined matches, outliers; the last pose of each drive is independent."""
+    rng, motion, n = np.random.default_rng(7), FreeMotion(0.0, 0.1, 0.0, 0.2), 200
+    errors, covariances, accepted = [], [], 0
+    for _ in range(n):
+        bias, estimator = rng.multivariate_normal(np.zeros(3), SHARED), PoseEstimator(Standing(), motion)
+        for k, pose in enumerate(wander(rng, 20, motion)):
+            estimator.move(Reading(0.0, 0.0, STEP_S))
+            vague = k > 0 and rng.random() < 0.3
+            noise = np.diag(np.square([0.004, math.radians(12), math.radians(0.3)])) if vague else NOISE
+            view = estimator.standing.view(pose) + bias + rng.multivariate_normal(np.zeros(3), noise)
+            if k > 0 and rng.random() < 0.05:
+                view[1] += rng.uniform(0.5, 5.5)
+            found = estimator.see(match_of(view, noise, reason="undetermined" if vague else ""))
+        assert found.pose is not None
+        apart = found.pose - pose
+        errors.append([*apart[:2], math.remainder(apart[2], math.tau)])
+        covariances.append(found.covariance)
+        accepted += found.accepted
+    # N = 200, three degrees of freedom each; a 99.9 % interval
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 3 * n)
+    assert low < nees(np.array(errors), np.array(covariances)).sum() < high
+    assert accepted > 0.9 * n
+
+
+def test_a_recording_s_bias_does_not_average_out():
+    estimator = PoseEstimator(Standing(), FreeMotion(0.0, 1e-4, 0.0, 1e-4))
+    for _ in range(200):
+        estimator.move(Reading(0.0, 0.0, STEP_S))
+        found = estimator.see(match_of((1.0, 0.0, 0.0)))
+    assert found.covariance is not None
+    # at rest before the landmark x shows D: its noise averages out, the bias of 5 mm stays
+    assert math.sqrt(found.covariance[0, 0]) == pytest.approx(0.005, rel=0.01)
+
+
+def test_mirror_rivals_are_kept_apart_until_motion_decides():
+    """Two views of one frame, δ and −δ: as the robot circles to the left only one of them moves as it drives."""
+    motion = FreeMotion(0.5, 0.5, 0.02, 0.02, 0.01)
+    estimator, said = PoseEstimator(Standing(), motion), []
+    for k in range(25):
+        delta = 0.3 + 0.02 * k
+        rival = Candidate("a", 1.0, -delta, 10.0, 0.5)
+        if k:
+            estimator.move(Reading(0.0, 0.02, STEP_S))  # the gyro turns with the true one
+        view = (1.0, delta, 0.0)
+        said.append(estimator.see(match_of(view, reason="ambiguous", shared=None, alternatives=(rival,))))
+    assert said[0].reason == "ambiguous"
+    assert len(said[0].poses) == 2
+    assert said[-1].accepted
+    assert said[-1].pose[2] == pytest.approx(delta, abs=0.03)
+    assert not any(one.accepted and abs(one.pose[2] - 0.3 - 0.02 * k) > 0.1 for k, one in enumerate(said))
+
+
+def test_an_outlier_is_refused_and_a_robot_that_was_put_elsewhere_is_found_again():
+    estimator = PoseEstimator(Standing(), FreeMotion(0.1, 0.1, 0.1, 0.1))
+    for view in [(1.0, 0.2, 0.0)] * 5:
+        estimator.move(Reading(0.0, 0.0, STEP_S))
+        before = estimator.see(match_of(view))
+    outlier = estimator.see(match_of((1.0, 1.4, 0.0)))
+    assert not outlier.used
+    np.testing.assert_array_equal(outlier.pose, before.pose)
+    assert not outlier.accepted  # two poses are probable now
+    again = estimator.see(match_of((1.0, 0.2, 0.0)))
+    assert again.accepted
+    assert again.used
+    for _ in range(3):
+        moved = estimator.see(match_of((1.0, 1.4, 0.0)))
+    assert moved.accepted
+    assert moved.pose[2] == pytest.approx(1.4, abs=0.02)
+
+
+def test_it_states_that_it_searches_is_lost_and_has_found_itself_again():
+    estimator = PoseEstimator(Standing(), FreeMotion(), lost_after_s=0.4)
+    assert estimator.see(None).reason == "searching"
+    assert estimator.see(match_of((1.0, 0.2, 0.0))).accepted
+    reasons = []
+    for _ in range(10):
+        estimator.move(Reading(0.0, 0.0, 0.1))
+        reasons.append(estimator.see(None).reason)
+    assert reasons[-1] == "lost"
+    assert estimator.see(match_of((1.3, 2.0, 0.0))).accepted
+
+
+def test_of_a_wide_plane_only_distance_and_heading_are_measured():
+    estimator = PoseEstimator(Standing(flat=True), FreeMotion())
+    seen = replace(match_of((1.0, 0.3, 0.0)), free=FREE[:2], covariance=NOISE[:2, :2], systematic={})
+    found = estimator.see(seen)
+    assert found.accepted
+    assert found.pose is not None
+    assert found.pose[0] == pytest.approx(-math.cos(0.3))
+    assert found.covariance[1, 1] > 1
