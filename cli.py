@@ -26,6 +26,7 @@ from phasemark.matcher.commands import (
     demo,
     design,
     drive,
+    live,
     locate,
     match,
     plan,
@@ -62,6 +63,7 @@ Then, by task:
   make labelled frames   phasemark plan example frames > frames.toml; phasemark frames build frames.toml -o frames.h5
   know the accuracy      phasemark accuracy --class cylinder --distance 1.5     in full: phasemark sweep run paper
   drive a robot          phasemark drive
+  follow a board's pose  phasemark live /dev/ttyUSB0 --landmark part.stl --part-unit mm --sensor vl53l5cx-8x8
 
 phasemark --help lists all commands, COMMAND --help explains one, --install-completion teaches them to your shell.
 """
@@ -118,7 +120,7 @@ def _add_commands(group: str, purpose: str, *functions: Callable[..., None]) -> 
 _add_commands(
     "", "",
     render.render_frame, match.match_frames, calibrate.calibrate_camera, locate.locate_rig, accuracy.accuracy_line,
-    demo.demo_report, drive.drive_robot, warm.warm_kernels,
+    demo.demo_report, drive.drive_robot, live.live_poses, warm.warm_kernels,
 )  # fmt: skip
 _add_commands(
     "landmark", "The landmarks: the catalogue and mesh files.",

@@ -21,6 +21,7 @@ from phasemark.matcher.direct_method import (
     refuse_direct_options,
     with_direct_errors,
 )
+from phasemark.matcher.estimate.acceptance import with_parts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
@@ -317,6 +318,46 @@ class Matcher:
         if on == "reported":
             frames = frames.with_chip_error()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
+
+    def track(self, frames: FilteredFrames, near: Sequence[Match]) -> Match:
+        """Match one frame from the views that are expected of it: no search, and no look for rivals elsewhere.
+
+        What a camera shows a moment later costs a refinement. The answer is refused for the reasons of
+        :meth:`match`, but the rivals it is compared with are the expected views alone; so a full match has to be made
+        from time to time. Errors that all frames share are those of the first expected view.
+
+        Parameters
+        ----------
+        frames : FilteredFrames
+            One position.
+        near : sequence of Match
+            Answers for earlier frames, with the views that are expected now.
+
+        Returns
+        -------
+        Match
+
+        Raises
+        ------
+        UsageError
+            The method is not "refine", histograms or targets are matched, no view is expected, there are several
+            frames, or the frame comes from another camera than the bank.
+        """
+        if self.method != "refine" or self._direct is not None:
+            raise UsageError('track takes method="refine" on ranges, reported ranges or phasors')
+        near = [one for one in near if one.class_name is not None]
+        if not near or len(frames) != 1:
+            raise UsageError("track takes one frame and at least one expected view")
+        if self._by_evidence:
+            kinds = {None: near[0].background is None and not near[0].among_unknown, "unknown": near[0].among_unknown}
+            own = (one for one in self._by_evidence if kinds.get(one.options["background"], True))
+            return next(own, self._by_evidence[0]).track(frames, near)
+        assert isinstance(self._method, LikelihoodMatcher)
+        frames = self.read_out(frames).without_offset().with_pooled_noise()
+        if self.options["on"] == "reported":
+            frames = frames.with_chip_error()
+        found = self._method.track(frames if self._one is None else self._of_one_frequency(frames, self._one), near)
+        return with_parts(self._method.rules, found, {name: near[0].systematic[name] for name in near[0].systematic})
 
     def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
         """Match histograms of several known poses as those of one landmark that is seen from all of them.

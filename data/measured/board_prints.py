@@ -74,12 +74,13 @@ class Printed:
 
 @dataclass
 class BoardLog:
-    """Lines of a log, the frame that has begun, and what of the log is left out."""
+    """Lines of a log, the frame that has begun, and what of the log is left out; `is_live`: read as it is printed."""
 
     file: BinaryIO
     path: Path
     n_zones: int
     others: Mapping[str, re.Pattern[str]] = field(default_factory=dict)
+    is_live: bool = False
     frame: Printed | None = None
     n_damaged: int = 0
     first_damage: str | None = None
@@ -208,6 +209,8 @@ def zone_lines(log: BoardLog) -> Iterator[Printed]:
             seen = match["found"] is None or int(match["found"]) > 0
             frame.distance_mm.append(float(match["mm"] or match["first_mm"]) if seen else math.nan)
             frame.status.append(float(match["status"] or match["first_status"]) if seen else math.nan)
+            if log.is_live and zone + 1 == log.n_zones:  # whole: no need to wait for the next frame to begin
+                yield from log.ended()
         elif not text.strip() or "Print data no" in text:
             yield from log.ended()
         else:

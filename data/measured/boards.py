@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import warnings
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -170,14 +170,40 @@ def read_board_log(file: BinaryIO, board: Board, sensor: Sensor, shape: tuple[in
     for name, values, expected in (("status", status, len(distance)), ("time", times, n_frames)):
         if len(values) not in (0, expected):
             raise InputFileError(f"{path}: some frames have a {name}, others have none")
-    arrays = {"range": distance, "status": status} if status else {"range": distance}
+    return recording_of(board, distance, status, times, sensor, shape)
+
+
+def recording_of(
+    board: Board,
+    distance_mm: Sequence[float],
+    status: Sequence[float],
+    times_s: Sequence[float],
+    sensor: Sensor,
+    shape: tuple[int, int],
+) -> Recording:
+    """Return whole frames of a board as columns, brought into the chip's own order of zones.
+
+    Parameters
+    ----------
+    board : Board
+    distance_mm, status : sequence of float
+        Of all zones of all frames; no status if none is printed.
+    times_s : sequence of float
+        Of all frames; empty if none is printed.
+    sensor : Sensor
+        Its quantity is that of a board without one of its own.
+    shape : (rows, cols)
+    """
+    arrays = {"range": distance_mm, "status": status} if len(status) else {"range": distance_mm}
     return Recording(
         {
-            name: board.orientation.apply(np.frombuffer(values, np.float32).reshape(-1, *shape)).reshape(-1, n_zones)
+            name: board.orientation.apply(np.asarray(values, np.float32).reshape(-1, *shape)).reshape(
+                -1, shape[0] * shape[1]
+            )
             for name, values in arrays.items()
         },
         {"unit": "mm", "quantity": board.quantity or sensor.quantity},
-        np.frombuffer(times) if times else None,
+        np.array(times_s, np.float64) if len(times_s) else None,
         flat=True,
         valid_status=board.valid_status,
     )

@@ -153,10 +153,48 @@ def read_frames(
         raise UsageError(f"'rotate' must be 0, 90, 180 or 270, got {rotate!r}")
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
-    shape = (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
-    raw = _read(path, shape, untrusted, topic, sensor, board)
+    raw = _read(path, shape_before(sensor, rotate), untrusted, topic, sensor, board)
     if board is not None and raw.valid_status is None:
         raise UsageError(f"{path}: board=… goes with text that a board printed: leave it out")
+    return frames_of(
+        raw, path, sensor=sensor, unit=unit, quantity=quantity, invalid_means=invalid_means,
+        valid_status=valid_status, flip_h=flip_h, flip_v=flip_v, rotate=rotate,
+    )  # fmt: skip
+
+
+def shape_before(sensor: Sensor, rotate: int) -> tuple[int, int]:
+    """Return rows and columns of a frame before it is turned clockwise by some degrees."""
+    return (sensor.cols, sensor.rows) if rotate in (90, 270) else (sensor.rows, sensor.cols)
+
+
+def frames_of(
+    raw: Recording,
+    path: Path,
+    *,
+    sensor: Sensor,
+    unit: Unit | None = None,
+    quantity: RangeOrZ | None = None,
+    invalid_means: InvalidMeans = "missing",
+    valid_status: Collection[int] | None = None,
+    flip_h: bool = False,
+    flip_v: bool = False,
+    rotate: int = 0,
+) -> Frames:
+    """Return the frames of columns that were read; `path` names their origin in messages.
+
+    Parameters
+    ----------
+    raw : Recording
+    path : Path
+    sensor, unit, quantity, invalid_means, valid_status, flip_h, flip_v, rotate
+        As for :func:`read_frames`.
+
+    Raises
+    ------
+    InputFileError, UsageError
+        As :func:`read_frames`.
+    """
+    shape = shape_before(sensor, rotate)
     if unit is None and quantity is None and not raw.stated:
         raise UsageError(
             f"{path}: does not say its unit and quantity: give unit={'|'.join(METRES_PER_UNIT)} and"

@@ -21,14 +21,15 @@ from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
 from phasemark.matcher.likelihood.auto_background import AutoBackground
-from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M
+from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M, estimate_surroundings
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.floor_albedo import estimate_floors, fit_before_floors
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.profiles import with_profiles
+from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
-from phasemark.matcher.likelihood.search import search_views
+from phasemark.matcher.likelihood.search import near_settings, search_views
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import Scene, Setup, check_free
 from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_errors
@@ -36,7 +37,7 @@ from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
-from phasemark.matcher.nearest.bank_minima import Search, Upward
+from phasemark.matcher.nearest.bank_minima import Search, Starts, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
@@ -60,6 +61,8 @@ the solution."""
 _FEWEST_PER_PARAMETER, _FURTHER_ZONES = 6, 3
 """Returns that each free parameter takes among unknown things or outliers; zones of a chip, which are few but show one
 surface each, that an answer explains beyond its number of free parameters."""
+_WALL_MOVES_M = 0.1
+"""By how much a wall may be elsewhere than is expected of a frame that is tracked."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 20
 """Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
@@ -162,6 +165,39 @@ class LikelihoodMatcher:
         if "motion" not in self._systematic:
             return answers
         return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)
+
+    @property
+    def rules(self) -> Rules:
+        """Rules by which an answer is accepted."""
+        return self._setup.rules
+
+    def track(self, frames: FilteredFrames, near: Sequence[Match]) -> Match:
+        """Match one filtered frame from expected views alone, before an expected background.
+
+        Of an automatic background the frame tells how far the wall is, where that is near where it is expected.
+        """
+        evidence, setup = Evidence.from_frames(frames, self._setup.on), self._setup
+        names = list(setup.rules.names)
+        classes = np.array([names.index(one.class_name) for one in near if one.class_name is not None], np.int64)
+        views = np.array([[getattr(one, name) for name in VIEW] for one in near])
+        scene, behind = self._scene, self._stated
+        if self._auto:
+            behind = near[0].background
+            if behind is not None and behind.wall_m is not None:
+                seen = estimate_surroundings(frames, 0, bearing_known=True, tilt_known=True).background
+                if seen is not None and seen.wall_m is not None and abs(seen.wall_m - behind.wall_m) < _WALL_MOVES_M:
+                    behind = replace(behind, wall_m=seen.wall_m, wall_albedo=seen.wall_albedo)
+            scene = self._scene_before([] if behind is None else [behind])
+        if evidence.tilt_rad.any():
+            self._check_tilted()
+            scene = replace(scene, final=self._rendered, scout=None)
+        starts = Starts(np.zeros(len(views), np.int64), classes, views)
+        fits = refine(scene.final, evidence, starts, near_settings(scene, evidence))
+        if setup.unknown and not setup.reports_one_surface:
+            fits = fit_without_borders(scene, evidence, fits)
+        bare = bare_cost(evidence.seen, scene.behind)
+        (answer,) = rank(setup.rules, fits, self._doubt(fits), bare, [behind])
+        return answer
 
     def _parts(self, which: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Return frames in parts that are matched at once."""

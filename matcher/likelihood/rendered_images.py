@@ -198,21 +198,26 @@ class RenderedModel(ImageModel):
         free: Sequence[str],
         step: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
-        """Render both ends."""
+        """Render both ends, those of all parameters that change the same rows at once."""
         slope = np.zeros((len(view), len(free), self.sensor.rows * self.sensor.cols), np.complex128)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
+            together: dict[tuple[tuple[int, int] | None, int], list[int]] = {}
             for k, name in enumerate(free):
-                rows, first = self._changing_rows(name, view[of])
-                axis = VIEW.index(name)
-                ends = []
-                for side in (1.0, -1.0):
-                    moved = view[of]
-                    moved[:, axis] += side * np.maximum(step[of, k], STEP)
-                    self.clip(moved, of)
-                    ends.append((moved[:, axis], self._render(c, moved, of, rows).phasor.reshape(len(of), -1)))
-                width = np.maximum(ends[0][0] - ends[1][0], STEP)
-                slope[of, k, first:] = (ends[0][1] - ends[1][1]) / width[:, None]
+                together.setdefault(self._changing_rows(name, view[of]), []).append(k)
+            for (rows, first), own in together.items():
+                ends = np.tile(view[of], (2 * len(own), 1, 1))
+                axes = [VIEW.index(free[k]) for k in own]
+                for j, (k, axis) in enumerate(zip(own, axes, strict=True)):
+                    width = np.maximum(step[of, k], STEP)
+                    ends[2 * j, :, axis] += width
+                    ends[2 * j + 1, :, axis] -= width
+                moved, each = ends.reshape(-1, len(VIEW)), np.tile(of, 2 * len(own))
+                self.clip(moved, each)
+                phasor = self._render(c, moved, each, rows).phasor.reshape(len(ends), len(of), -1)
+                for j, (k, axis) in enumerate(zip(own, axes, strict=True)):
+                    width = np.maximum(ends[2 * j, :, axis] - ends[2 * j + 1, :, axis], STEP)
+                    slope[of, k, first:] = (phasor[2 * j] - phasor[2 * j + 1]) / width[:, None]
         return slope
 
     def differences(

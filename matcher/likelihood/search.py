@@ -34,7 +34,7 @@ from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 
-__all__ = ["are_doubtful", "fit_views", "search_views"]
+__all__ = ["are_doubtful", "fit_views", "near_settings", "search_views"]
 
 
 _SLACK = 8 * DISAGREEMENT
@@ -460,6 +460,11 @@ def fit_neighbouring_views(scene: Scene, evidence: Evidence, which: NDArray[np.i
     again = around[order[place < MOST_REFINED]]
     rival = least_of_frame(fits, len(evidence.weight))[again.frame]
     return refine(scene.final, evidence, again, close, rival=rival)
+
+
+def near_settings(scene: Scene, evidence: Evidence) -> DescentSettings:
+    """Return how a descent runs from a view that is expected, as in the frame before: it looks nowhere else."""
+    return replace(_close_settings(scene, evidence), look_beside_rad=())
 
 
 def _close_settings(scene: Scene, evidence: Evidence) -> DescentSettings:

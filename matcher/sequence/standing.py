@@ -35,6 +35,9 @@ class Standing:
     flat : bool
         Whether the landmark is a wide plane across the x axis, which does not show where along it the camera stands:
         x and the heading are then all that is measured.
+    one_side : bool
+        Whether a symmetric landmark is taken to be seen first from the side that δ = 0 faces, within half a period, as
+        is right where its own frame is all that matters. Otherwise every side is a pose of its own.
     """
 
     landmark_xy_m: tuple[float, float] = (0.0, 0.0)
@@ -43,6 +46,7 @@ class Standing:
     pan_offset_xy_m: tuple[float, float] = (0.0, 0.0)
     lens_offset_xy_m: tuple[float, float] = (0.0, 0.0)
     flat: bool = False
+    one_side: bool = True
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -62,15 +66,18 @@ class Standing:
         match : Match
             With a covariance.
         about : (3,) float64, optional
-            Pose at which an undetermined match is linear: its covariance is too wide for the curve that it lies along.
+            Expected pose, at which an undetermined match is linear: its covariance is too wide for the curve that it
+            lies along. None: nothing is expected.
         """
         if about is not None and match.reason == "undetermined":
             return [self._about(match, about)]
         found = []
         for one, share in _explanations(match):
+            if about is None and self.one_side:
+                one = replace(one, delta_rad=math.remainder(one.delta_rad, math.tau / one.symmetry), symmetry=1)
             for pose in self._poses(one):
                 at = np.array([pose.x_m, pose.y_m, pose.heading_rad])
-                found.append(self._sighting(one, pose, at, math.log(share / match.symmetry)))
+                found.append(self._sighting(one, pose, at, math.log(share / one.symmetry)))
         return found
 
     def _about(self, match: Match, about: NDArray[np.float64]) -> Sighting:

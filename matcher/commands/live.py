@@ -1,0 +1,195 @@
+"""The command ``phasemark live``: poses from a board's stream."""
+
+# Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from phasemark import UsageError
+from phasemark.data.commands.command import Shown, Without
+from phasemark.data.commands.console import LongWork, echo_json, tell
+from phasemark.data.commands.inputs import open_any_bank, read_landmark, read_sensor
+from phasemark.data.commands.options import Force, FrameReading, Json, MeshReading, SensorName
+from phasemark.matcher.commands.match_options import Landmark, Search
+
+if TYPE_CHECKING:
+    from phasemark.data import Bank
+    from phasemark.matcher.live import Live, Source, Tracker
+    from phasemark.render import Sensor
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Options for how the camera moves.
+
+    Parameters
+    ----------
+    speed
+        Fastest the camera moves, m/s.
+    turn_rate
+        Fastest it turns, degrees a second.
+    delay_ms
+        Added to the stamp of a frame to get the time of its pose; unless stated, the sensor's.
+    flat
+        The landmark is a wide plane that does not show where along it the camera is: distance and heading alone count.
+    """
+
+    speed: Annotated[float, Shown(metavar="M/S")] = 0.5
+    turn_rate: Annotated[float, Shown(metavar="DEG/S")] = 90.0
+    delay_ms: Annotated[float | None, Shown(metavar="MS")] = None
+    flat: bool = False
+
+    def check(self) -> None:
+        """Refuse speeds that are none."""
+        for flag, value in (("--speed", self.speed), ("--turn-rate", self.turn_rate)):
+            if not 0 < value < math.inf:
+                raise UsageError(f"{flag} must be positive, got {value:g}")
+
+
+def live_poses(
+    source: str,
+    *,
+    landmark_name: Annotated[Path, Shown("--landmark", metavar="BANK|MESH|CLASS")],
+    sensor: SensorName | None = None,
+    distance: Annotated[str, Shown(metavar="FROM:TO")] = "0.3:1.5",
+    to: Annotated[list[str] | None, Shown(metavar="SINK")] = None,
+    reading: FrameReading,
+    mesh: Annotated[Landmark, Without("sensor")],
+    search: Annotated[Search, Without("method", "filter_name", "pixels", "robust")],
+    motion: Motion,
+    page: Annotated[int | None, Shown(metavar="PORT")] = None,
+    view: bool = False,
+    at_once: bool = False,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Follow the pose before a landmark from a board's stream, and publish it.
+
+    SOURCE is a serial port (/dev/ttyUSB0, or serial:///dev/ttyUSB0?baud=921600), - for standard input,
+    tcp://HOST:PORT, udp://:PORT, zmq://HOST:PORT of a TMF8829, or a recording, which is replayed in time. A pose that
+    is not accepted is not published; the status says why. Ctrl-C ends it.
+
+    Parameters
+    ----------
+    source
+        Where frames come from.
+    landmark_name
+        A bank; or a landmark, of which a bank is built and kept.
+    sensor
+        Without a bank: a preset or sensor file.
+    distance
+        Without a bank: distances from the landmark, metres.
+    to
+        Where poses go; repeatable: - or jsonl:FILE, ros:NAME, mavlink:udpout:HOST:PORT, mcap:FILE, foxglove://HOST:PORT.
+    page
+        Serve a page with zones, residuals and pose on this port of localhost.
+    view
+        Show zones, residuals and pose in the terminal.
+    at_once
+        Replay a recording as fast as it is matched, each search in line.
+    """
+    from phasemark.matcher.live import Live, open_sink, open_source
+
+    motion.check()
+    with _bank(landmark_name, mesh, sensor, distance) as bank:
+        camera = bank.camera
+        found = open_source(source, camera, vars(reading), in_time=not at_once)
+        sinks = [open_sink(name, camera, force=force) for name in to or ["-"]]
+        with LongWork("getting bank and kernels ready"):
+            tracker = _tracker(bank, search, motion, found)
+            tracker.warm()
+        sinks += _views(tracker, camera, page, view)
+        session = Live(found, tracker, sinks, delay_s=tracker.delay_s, say=lambda line: tell(f"note: {line}"))
+        _until_interrupted(session, shows_status=not view and sys.stderr.isatty())
+        if as_json:
+            echo_json({"status": session.status.as_dict()})
+        else:
+            tell(f"note: {session.status.frames} frames, {session.status.accepted} poses published")
+
+
+def _bank(name: Path, mesh: Landmark, sensor: str | None, distance: str) -> Bank:
+    """Return the bank of a landmark: one that exists, a kept one, or a new one."""
+    if not mesh.is_for(name):
+        if sensor is not None:
+            raise UsageError(f"--sensor goes with a mesh or a class in place of a bank: {name} has its own")
+        return open_any_bank(name)
+    if sensor is None:
+        raise UsageError(f"--landmark {name} needs --sensor NAME, a preset (phasemark sensor list) or a file")
+    from phasemark.data import BankPlan
+    from phasemark.data.bank.bank_cache import cached_bank
+    from phasemark.data.plans.bank_plan import MeshPlan
+    from phasemark.landmarks import catalog
+
+    read_sensor(sensor)
+    is_class = str(name) in catalog()
+    read_landmark(str(name), MeshReading(mesh.part_unit, mesh.up, mesh.origin))
+    own = MeshPlan(name=name.stem, path=str(name), unit=mesh.part_unit, up=mesh.up, origin=mesh.origin)
+    axis: Any = f"{distance}:0.02" if distance.count(":") == 1 else distance
+    plan = BankPlan(
+        sensor=sensor,
+        distance_m=axis,
+        classes=(str(name),) if is_class else (),
+        landmarks=(),
+        meshes=() if is_class else (own,),
+        layout="factored" if is_class else "full",
+    ).resolve()
+    with LongWork("building a bank") as progress:
+        return cached_bank(plan, keep=not mesh.no_cache, progress=progress)
+
+
+def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Tracker:
+    """Return the tracker of a landmark; searches run beside it, but in line for a recording."""
+    from phasemark.matcher.live.mcap_log import McapSource
+    from phasemark.matcher.live.search_beside import SearchesAsLogged, SearchesBeside, SearchesInLine
+    from phasemark.matcher.live.tracker import Tracker
+    from phasemark.matcher.sequence import FreeMotion, PoseEstimator, Standing
+
+    if search.is_direct:
+        raise UsageError(f"--on {search.on}: phasemark live follows ranges, reported ranges or phasors")
+    matcher = search.for_bank(bank).matcher(bank)
+    # a speed that changes within a second from rest to the fastest
+    turn = math.radians(motion.turn_rate)
+    free = FreeMotion(motion.speed / 2, motion.speed, turn / 2, turn)
+    estimator = PoseEstimator(Standing(flat=motion.flat), free)
+    every = 30  # frames of a recording between two searches
+    searches: Any = SearchesBeside(matcher) if source.is_live else SearchesInLine(matcher, every)
+    if isinstance(source, McapSource):
+        searches = SearchesAsLogged(matcher, source.searches())
+    return Tracker(
+        matcher, estimator, searches, delay_s=None if motion.delay_ms is None else motion.delay_ms / 1e3
+    )  # fmt: skip
+
+
+def _views(tracker: Tracker, camera: Sensor, page: int | None, view: bool) -> list[Any]:
+    """Return the views of a session."""
+    shown: list[Any] = []
+    if page is not None:
+        from phasemark.matcher.live.page import PageView
+
+        shown.append(PageView(page, tracker))
+        tell(f"note: http://127.0.0.1:{shown[-1].port}/")
+    if view:
+        from phasemark.matcher.live.terminal import TerminalView
+
+        shown.append(TerminalView(tracker))
+    return shown
+
+
+def _until_interrupted(session: Live, *, shows_status: bool) -> None:
+    """Run a session until its source ends or the user ends it; files are then whole."""
+    before = {number: signal.signal(number, lambda *_: session.stop()) for number in (signal.SIGINT, signal.SIGTERM)}
+    if shows_status:
+        from phasemark.matcher.live.terminal import StatusLine
+
+        session.sinks += (StatusLine(),)
+    try:
+        session.run()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

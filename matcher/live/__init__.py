@@ -1,0 +1,15 @@
+"""Live poses: a board's frames as they are printed, matched and followed, and published."""
+
+from typing import TYPE_CHECKING
+
+from phasemark.inputs import on_use
+
+if TYPE_CHECKING:
+    from phasemark.matcher.live.session import Live, Update
+    from phasemark.matcher.live.sinks import Sink, open_sink
+    from phasemark.matcher.live.sources import Source, open_source
+    from phasemark.matcher.live.tracker import Locator, Tracker
+else:
+    __getattr__, __dir__ = on_use.imported_on_use(__name__)
+
+__all__ = ["Live", "Locator", "Sink", "Source", "Tracker", "Update", "open_sink", "open_source"]

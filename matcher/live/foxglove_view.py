@@ -1,0 +1,73 @@
+"""A server that Foxglove connects to: poses and status as topics to look at."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from phasemark import UsageError
+from phasemark.matcher.live.extras import needed
+from phasemark.matcher.live.sinks import Sink, as_dict
+
+if TYPE_CHECKING:
+    from phasemark.matcher.live.session import Update
+    from phasemark.matcher.live.status import Status
+
+
+class FoxgloveSink(Sink):
+    """Topics /pose (PoseInFrame, accepted poses), /zones (a grid of ranges as JSON), /update and /status (JSON).
+
+    Parameters
+    ----------
+    name : str
+    address : str
+        HOST:PORT of the server.
+
+    Raises
+    ------
+    UsageError
+        The port is taken, or the package is missing.
+    """
+
+    def __init__(self, name: str, address: str) -> None:
+        super().__init__(name)
+        foxglove = needed("foxglove", "the sink 'foxglove'", "foxglove")
+        self._messages = needed("foxglove.messages", "", "foxglove")
+        channels = needed("foxglove.channels", "", "foxglove")
+        host, _, port = address.rpartition(":")
+        if not host or not port.isdigit():
+            raise UsageError(f"{name}: must be foxglove://HOST:PORT, as in foxglove://127.0.0.1:8765")
+        context = foxglove.Context()
+        try:
+            self._server = foxglove.start_server(name="phasemark", host=host, port=int(port), context=context)
+        except (RuntimeError, OSError, OverflowError) as error:
+            raise UsageError(f"{name}: the port cannot be used ({error}): give another one") from None
+        self._pose = channels.PoseInFrameChannel("/pose", context=context)
+        self._update, self._status, self._zones = (
+            foxglove.Channel(topic, message_encoding="json", context=context)
+            for topic in ("/update", "/status", "/zones")
+        )
+
+    def update(self, update: Update) -> None:
+        """Send a pose, if it is accepted, and what is known."""
+        found, now = update.located.estimate, int(update.time_s * 1e9)
+        self._update.log(as_dict(update), log_time=now)
+        ranges = update.frames.range_m[0, 0]
+        rows = [[None if value != value else value for value in row] for row in ranges.tolist()]
+        self._zones.log({"range_m": rows}, log_time=now)
+        if not update.reason and found.pose is not None:
+            own, heading = self._messages, float(found.pose[2])
+            pose = own.Pose(
+                position=own.Vector3(x=float(found.pose[0]), y=float(found.pose[1]), z=0.0),
+                orientation=own.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2)),
+            )
+            stamp = own.Timestamp(sec=now // 10**9, nsec=now % 10**9)
+            self._pose.log(own.PoseInFrame(timestamp=stamp, frame_id="landmark", pose=pose), log_time=now)
+
+    def status(self, status: Status) -> None:
+        """Send the status."""
+        self._status.log(status.as_dict())
+
+    def close(self) -> None:
+        """Stop the server."""
+        self._server.stop()

@@ -1,0 +1,169 @@
+"""Logs in MCAP: every frame, match and pose as JSON, and the replay of their frames, bit for bit."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark import InputFileError
+from phasemark.matcher.live.extras import needed
+from phasemark.matcher.live.sinks import Sink, as_dict, open_output
+from phasemark.matcher.live.sources import Arrival, Source
+from phasemark.render import Frames, Sensor
+
+if TYPE_CHECKING:
+    from phasemark.matcher.live.session import Update
+    from phasemark.matcher.live.status import Status
+
+_TOPICS = ("frames", "matches", "poses", "status")
+_LIBRARY = "phasemark"
+
+
+class McapSink(Sink):
+    """Log of everything; the file is whole when the session ends, by Ctrl-C too.
+
+    Parameters
+    ----------
+    name : str
+    path : Path
+    sensor : Sensor
+        Kept in the log, as a sensor file has it.
+    force : bool
+        Whether an existing file may be replaced.
+    """
+
+    def __init__(self, name: str, path: Path, sensor: Sensor, *, force: bool = False) -> None:
+        super().__init__(name)
+        writer = needed("mcap.writer", "the sink 'mcap'", "mcap")
+        self._file = open_output(path, force=force, mode="wb")
+        self._writer = writer.Writer(self._file)
+        self._writer.start(library=_LIBRARY)
+        self._writer.add_metadata("sensor", {"json": sensor.model_dump_json(exclude_none=True)})
+        self._channels = {}
+        for topic in _TOPICS:
+            schema = self._writer.register_schema(f"phasemark.{topic}", "jsonschema", b'{"type": "object"}')
+            self._channels[topic] = self._writer.register_channel(f"/{topic}", "json", schema)
+
+    def update(self, update: Update) -> None:
+        """Write a frame with all that was concluded."""
+        located = update.located
+        self._write("frames", update, {"index": update.number, **_frame_dict(update.frames)})
+        match = {} if located.match is None else located.match.as_dict()
+        self._write("matches", update, {"index": update.number, "searched": located.searched, **match})
+        self._write("poses", update, as_dict(update))
+
+    def status(self, status: Status) -> None:
+        """Write the status."""
+        self._message("status", time.time(), status.as_dict())
+
+    def _write(self, topic: str, update: Update, row: dict[str, Any]) -> None:
+        self._message(topic, update.time_s, row)
+
+    def _message(self, topic: str, time_s: float, row: dict[str, Any]) -> None:
+        now = max(int(time_s * 1e9), 0)
+        data = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
+        self._writer.add_message(self._channels[topic], log_time=now, publish_time=now, data=data)
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._writer.finish()
+        self._file.close()
+
+
+class McapSource(Source):
+    """Frames of a log that :class:`McapSink` wrote, with the stamps and the numbers that they had.
+
+    Parameters
+    ----------
+    path : Path
+    sensor : Sensor
+        The camera, whose pixels the frames must have.
+    in_time : bool
+        Whether frames come in the rhythm of their stamps.
+    """
+
+    is_live = False
+
+    def __init__(self, path: Path, sensor: Sensor, *, in_time: bool) -> None:
+        super().__init__(str(path))
+        self._path, self._sensor, self._in_time, self._stopped = path, sensor, in_time, False
+        self._rows = self._read("/frames")
+        if not self._rows:
+            raise InputFileError(f"{path}: holds no frames of a live session")
+
+    def _read(self, topic: str) -> list[dict[str, Any]]:
+        reader = needed("mcap.reader", f"{self._path}", "mcap")
+        try:
+            with open(self._path, "rb") as file:
+                messages = reader.make_reader(file).iter_messages(topics=[topic], log_time_order=False)
+                return [json.loads(message.data) for _, _, message in messages]
+        except OSError as error:
+            raise InputFileError(f"{self._path}: cannot be read ({error.strerror})") from None
+        except Exception as error:  # whatever a damaged file makes mcap and json say
+            raise InputFileError(f"{self._path}: damaged, or no MCAP file ({str(error)[:120]})") from None
+
+    def searches(self) -> dict[int, int]:
+        """Return which earlier frame's full search was used with which frame."""
+        rows = self._read("/matches")
+        return {row["index"]: row["searched"] for row in rows if row.get("searched") is not None}
+
+    def frames(self) -> Iterator[Arrival]:
+        """Yield the frames."""
+        began, first = time.monotonic(), None
+        for row in self._rows:
+            frames = _frames_of(row, self._sensor, self._path)
+            stamp = None if frames.time_s is None else float(frames.time_s.flat[0])
+            first = stamp if first is None else first
+            if self._in_time and stamp is not None and first is not None:
+                while not self._stopped and time.monotonic() < began + stamp - first:
+                    time.sleep(min(max(began + stamp - first - time.monotonic(), 0.0), 0.05))
+            if self._stopped:
+                return
+            yield Arrival(frames, time.monotonic())
+
+    def stop(self) -> None:
+        """Let the frames end."""
+        self._stopped = True
+
+
+def _frame_dict(frames: Frames) -> dict[str, Any]:
+    """Return one frame as plain numbers, each with all of its digits."""
+    row: dict[str, Any] = {"stamp_s": None if frames.time_s is None else float(frames.time_s.flat[0])}
+    row["range_m"] = _plain(frames.range_m)
+    row["flags"] = frames.flags.ravel().tolist()
+    for name in ("amplitude_e", "intensity_e", "tilt_rad"):
+        if (values := getattr(frames, name)) is not None:
+            row[name] = _plain(values)
+    return row
+
+
+def _plain(values: NDArray[np.float64]) -> list[float | None]:
+    return [None if value != value else value for value in values.ravel().tolist()]
+
+
+def _frames_of(row: dict[str, Any], sensor: Sensor, path: Path) -> Frames:
+    shape = (1, 1, sensor.rows, sensor.cols)
+    try:
+        arrays: dict[str, Any] = {
+            name: np.array(row[name], np.float64).reshape((1, 1, 2) if name == "tilt_rad" else shape)
+            for name in ("range_m", "amplitude_e", "intensity_e", "tilt_rad")
+            if name in row
+        }
+        stamp = row["stamp_s"]
+        return Frames(
+            arrays.pop("range_m"),
+            **arrays,
+            flags=np.array(row["flags"], np.uint8).reshape(shape),
+            sensor=sensor,
+            time_s=None if stamp is None else np.array([[stamp]], np.float64),
+        )
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputFileError(
+            f"{path}: frame {row.get('index')} is none of {sensor.rows} × {sensor.cols} ({error})"
+        ) from None

@@ -1,0 +1,67 @@
+"""Picture of a session: zones, residuals and pose, as plain numbers that terminal and page show."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from phasemark.matcher.live.session import Update
+from phasemark.matcher.live.sinks import as_dict
+from phasemark.matcher.matcher import Matcher
+from phasemark.matcher.position.robot_pose import PRIOR_STD
+from phasemark.render import Renderer, Views
+from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.view import VIEW_FIELDS
+
+__all__ = ["Pictures"]
+_MOST_M = PRIOR_STD[0]
+"""Residuals beyond this show something else than the landmark."""
+
+
+class Pictures:
+    """Makes pictures of updates.
+
+    Parameters
+    ----------
+    matcher : Matcher
+        Its bank has the landmarks that are rendered beside what was measured.
+    """
+
+    def __init__(self, matcher: Matcher) -> None:
+        self._bank = matcher.bank
+        self._renderers: dict[str, Renderer] = {}
+
+    def of(self, update: Update) -> dict[str, Any]:
+        """Return zones and residuals, rows from the top, None where there is none, and the pose as JSON has it."""
+        range_m = update.frames.range_m[0, 0]
+        found: dict[str, Any] = {**as_dict(update), "range_m": _plain(range_m), "residual_mm": None}
+        found["poses"] = [[round(share, 4), *pose.round(4).tolist()] for share, pose in update.located.estimate.poses]
+        if not update.reason:
+            found["std"] = np.sqrt(np.diag(found["covariance"])).tolist()
+        match = update.located.match
+        if match is not None and match.class_name is not None and math.isfinite(match.distance_m):
+            residual_m = wrap_difference_m(update.located.filtered.range_m[0] - self._model(match), self._bank.sensor)
+            residual_m = np.where(np.abs(residual_m) > _MOST_M, np.nan, residual_m)
+            found["residual_mm"] = _plain(1e3 * (residual_m - self._bank.camera.range_offset_m))
+            found["match"] = {"class": match.class_name, "reason": match.reason, "chi2": _or_none(match.chi2)}
+        return found
+
+    def _model(self, match: Any) -> NDArray[np.float64]:
+        """Return the range image of a match's view."""
+        name = match.class_name
+        if name not in self._renderers:
+            mesh = self._bank.mesh(name)
+            self._renderers[name] = Renderer(mesh, self._bank.sensor, albedo=float(mesh.metadata["albedo"]))
+        views = Views.broadcast(*(getattr(match, field) for field in VIEW_FIELDS))
+        return np.asarray(self._renderers[name].render_views(views, background=match.background).range_m[0])
+
+
+def _plain(values: NDArray[np.float64]) -> list[list[float | None]]:
+    return [[_or_none(round(value, 4)) for value in row] for row in values.tolist()]
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,245 @@
+"""A live session: the newest frame of a source is located, and the pose published if it is accepted."""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from phasemark.matcher.live.sinks import Sink
+from phasemark.matcher.live.sources import Arrival, Source, SourceFault
+from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.tracker import Located, Locator
+from phasemark.render import Frames
+
+_RETRY_S = 0.2
+"""Pause before a source is opened again."""
+_SETTLES_S = 0.3
+"""Stamps have to run forward for so long after a jump before a pose is published."""
+_DRIFT = 1e-4
+"""By how much the source's clock may run slow against ours, seconds a second."""
+
+
+@dataclass(frozen=True, eq=False)
+class Update:
+    """Outcome of one frame.
+
+    Parameters
+    ----------
+    number : int
+        Of the frame, from 0.
+    frames : Frames
+        The frame.
+    stamp_s : float
+        Its stamp on the source's clock; when it arrived where the source has none.
+    pose_stamp_s : float
+        Time of the pose on that clock: the stamp with the sensor's delay.
+    time_s : float
+        Time of the pose on our clock, seconds since 1970; of a recording the same as `pose_stamp_s`.
+    located : Located
+        What was found.
+    reason : str
+        Why the pose is not published; empty where it is.
+    latency_s : float
+        From the last byte of the frame to this.
+    """
+
+    number: int
+    frames: Frames
+    stamp_s: float
+    pose_stamp_s: float
+    time_s: float
+    located: Located
+    reason: str
+    latency_s: float
+
+
+class _Newest:
+    """The newest frame; what nobody took in time is counted. Of a recording every frame is kept until it is taken."""
+
+    def __init__(self, keeps_all: bool) -> None:
+        self._changed, self._keeps_all = threading.Condition(), keeps_all
+        self._held: Arrival | None = None
+        self.n_dropped = 0
+        self.is_over = False
+        self.error: Exception | None = None
+
+    def put(self, arrival: Arrival) -> None:
+        """Put a frame in the place of the one before."""
+        with self._changed:
+            while self._keeps_all and self._held is not None and not self.is_over:
+                self._changed.wait()
+            self.n_dropped += self._held is not None
+            self._held = arrival
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> Arrival | None:
+        """Return a frame that is new, None if none comes in time."""
+        with self._changed:
+            if self._held is None and not self.is_over:
+                self._changed.wait(timeout_s)
+            found, self._held = self._held, None
+            self._changed.notify_all()
+            return found
+
+    def end(self, error: Exception | None = None) -> None:
+        """Say that no frame follows."""
+        with self._changed:
+            self.is_over, self.error = True, error
+            self._changed.notify_all()
+
+
+class Live:
+    """Locates the frames of a source as they come, and publishes accepted poses.
+
+    Parameters
+    ----------
+    source : Source
+    locator : Locator
+        Such as a :class:`~phasemark.matcher.live.Tracker`.
+    sinks : sequence of Sink
+        Each gets every :class:`Update`, and publishes a pose only if its `reason` is empty.
+    delay_s : float
+        Added to a stamp to get the time of its pose.
+    say : callable, optional
+        Called with a line about what happened to the source or a sink.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        locator: Locator,
+        sinks: Sequence[Sink] = (),
+        *,
+        delay_s: float = 0.0,
+        say: Callable[[str], None] | None = None,
+    ) -> None:
+        self.source, self.locator, self.sinks = source, locator, tuple(sinks)
+        self.status = Status(source.name)
+        self._delay_s, self._say = delay_s, say or (lambda line: None)
+        self._said = ""
+        self._stop = threading.Event()
+        self._newest = _Newest(keeps_all=not source.is_live)
+        self._number = -1
+        self._offset_s: float | None = None
+        self._holds_until_s = -math.inf
+        self._to_unix_s = time.time() - time.monotonic()
+
+    def stop(self) -> None:
+        """Let :meth:`run` return soon; may be called from a signal handler or another thread."""
+        self._stop.set()
+
+    def run(self, on_update: Callable[[Update], None] | None = None, every_s: float = 0.5) -> Status:
+        """Run until the source ends, or :meth:`stop` is called; then close the sinks.
+
+        Parameters
+        ----------
+        on_update : callable, optional
+            Called with each update.
+        every_s : float
+            Interval at which sinks get the status, seconds.
+
+        Raises
+        ------
+        UsageError
+            It is not known what the source's numbers mean.
+        """
+        reader = threading.Thread(target=self._read, daemon=True)
+        reader.start()
+        next_status = time.monotonic()
+        try:
+            while not self._stop.is_set():
+                arrival = self._newest.take(0.05)
+                if arrival is not None:
+                    update = self._located(arrival)
+                    self._publish(update)
+                    if on_update is not None:
+                        on_update(update)
+                elif self._newest.is_over:
+                    break
+                if time.monotonic() >= next_status:
+                    next_status = time.monotonic() + every_s
+                    self._report()
+        finally:
+            self._stop.set()
+            self.source.stop()
+            self._newest.end(self._newest.error)
+            self._report()
+            for sink in self.sinks:
+                sink.close()
+            self.locator.close()
+            reader.join(1.0)
+        if self._newest.error is not None:
+            raise self._newest.error
+        return self.status
+
+    def _read(self) -> None:
+        """Put the source's frames where they are taken; open it again after a fault."""
+        while not self._stop.is_set():
+            try:
+                for arrival in self.source.frames():
+                    self.status.fault = self._said = ""
+                    self._newest.put(arrival)
+                    if self._stop.is_set():
+                        return
+                if not self.source.is_live or not self._stop.is_set():
+                    self._newest.end()
+                    return
+            except SourceFault as fault:
+                self.status.fault = str(fault)
+                if str(fault) != self._said:
+                    self._said = str(fault)
+                    self._say(f"{fault}; tried again")
+                self._stop.wait(_RETRY_S)
+            except Exception as error:  # what a user has to mend, or a fault of ours: told by the caller's thread
+                self._newest.end(error)
+                return
+
+    def _located(self, arrival: Arrival) -> Update:
+        """Return what a frame shows."""
+        self._number += 1
+        stamps = arrival.frames.time_s
+        received = arrival.received_s + self._to_unix_s
+        stamp = received if stamps is None else float(stamps.flat[0])
+        located = self.locator.locate(arrival.frames, stamp)
+        if located.note:
+            self._holds_until_s, self._offset_s = stamp + _SETTLES_S, None
+            self._say(f"{self.source.name}: {located.note}")
+        reason = located.estimate.reason
+        if not reason and stamp < self._holds_until_s:
+            reason = "clock"
+        latency_s = time.monotonic() - arrival.received_s
+        self.status.dropped = self._newest.n_dropped
+        self.status.damaged = self.source.n_damaged
+        self.status.note(reason, latency_s, located.tracked)
+        shown = stamp + self._delay_s
+        on_ours = shown + self._offset(stamp, received) if self.source.is_live else shown
+        return Update(self._number, arrival.frames, stamp, shown, on_ours, located, reason, latency_s)
+
+    def _offset(self, stamp_s: float, received_s: float) -> float:
+        """Return what our clock shows more than the source's: the least that was seen, for frames come late alone."""
+        apart = received_s - stamp_s
+        if self._offset_s is None or abs(apart - self._offset_s) > 1.0:
+            self._offset_s = apart
+        self._offset_s = min(self._offset_s + _DRIFT / 15, apart)
+        return self._offset_s
+
+    def _publish(self, update: Update) -> None:
+        for sink in self.sinks:
+            self._guarded(sink, lambda own: own.update(update))
+
+    def _report(self) -> None:
+        for sink in self.sinks:
+            self._guarded(sink, lambda own: own.status(self.status))
+
+    def _guarded(self, sink: Sink, act: Callable[[Sink], None]) -> None:
+        """Let a sink act; one that fails is said in a line, and used again with the next frame."""
+        try:
+            act(sink)
+        except OSError as error:
+            line = f"{sink.name}: {error.strerror or error}"
+            if line != self._said:
+                self._said = line
+                self._say(line)

@@ -1,0 +1,382 @@
+"""Sources of frames: what a board prints, a TMF8829 over ZeroMQ, recordings replayed in time, and logs in MCAP."""
+
+from __future__ import annotations
+
+import math
+import re
+import struct
+import time
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark.data.measured import board_prints as prints
+from phasemark.data.measured.boards import BOARDS, Board, find_board, recording_of
+from phasemark.data.measured.csv_frames import parse_csv
+from phasemark.data.measured.reading import frames_of, read_frames, shape_before
+from phasemark.data.measured.recording import Recording
+from phasemark.matcher.live.extras import needed
+from phasemark.matcher.live.streams import Lines, Stream, address_of, open_stream
+from phasemark.render import Frames, Sensor
+
+STALLS_AFTER_S = 1.0
+"""A source that sends nothing for longer is opened again."""
+_LONGEST_LINE = 1 << 16
+_HEADER = re.compile(r"(^|[;,\t ])\"?(mm|range|z)_0\"?([;,\t ]|$)")
+_UNRECOGNISED_LINES = 256
+"""Lines after which a source is said to be of no known format."""
+
+
+class SourceFault(PhasemarkError):
+    """Fault of a source that is opened again: it stalled, was unplugged, or is of another format."""
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """One frame as it arrived.
+
+    Parameters
+    ----------
+    frames : Frames
+        One position with one frame; its stamp is the source's, if it has any.
+    received_s : float
+        When its last byte arrived, on the monotonic clock.
+    """
+
+    frames: Frames
+    received_s: float
+
+
+class Source(ABC):
+    """Source of frames, opened again after a fault.
+
+    Parameters
+    ----------
+    name : str
+        As the user gave it.
+
+    Attributes
+    ----------
+    is_live : bool
+        Whether frames come when they come: then the newest wins. Of a recording each is taken.
+    n_damaged : int
+        Frames that were incomplete or garbled, up to now.
+    damage : str
+        What was wrong with the last of them.
+    """
+
+    is_live = True
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.n_damaged, self.damage = 0, ""
+
+    @abstractmethod
+    def frames(self) -> Iterator[Arrival]:
+        """Open the source and yield its frames; ends where a recording ends.
+
+        Raises
+        ------
+        SourceFault
+            It has to be opened again.
+        """
+
+    def stop(self) -> None:  # noqa: B027  a source may end by itself
+        """Let :meth:`frames` end soon; called from another thread."""
+
+    def spoilt(self, damage: str) -> None:
+        """Count a frame that is left out."""
+        self.n_damaged, self.damage = self.n_damaged + 1, damage
+
+
+class PrintedSource(Source):
+    """Lines that a board prints, or lines of CSV, read from a stream.
+
+    Parameters
+    ----------
+    stream : Stream
+    sensor : Sensor
+    how : mapping
+        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean.
+    """
+
+    def __init__(self, stream: Stream, sensor: Sensor, how: Mapping[str, Any]) -> None:
+        super().__init__(stream.name)
+        self._stream, self._sensor = stream, sensor
+        self._how = {key: value for key, value in how.items() if key != "board"}
+        self._named: str | None = how.get("board")
+        self._shape = shape_before(sensor, int(how.get("rotate", 0)))
+        self._path = Path(self.name)
+        self._lines: Lines | None = None
+        self._header = b""
+
+    def frames(self) -> Iterator[Arrival]:
+        """Open the stream and yield its frames."""
+        try:
+            self._stream.open()
+        except OSError as error:
+            raise SourceFault(f"{self.name}: cannot be opened ({_reason(error)})") from None
+        self._lines = lines = Lines(self._stream, STALLS_AFTER_S)
+        try:
+            yield from self._parsed(lines)
+        except OSError as error:
+            raise SourceFault(f"{self.name}: is gone ({_reason(error)})") from None
+        finally:
+            self._stream.close()
+        if lines.fault and not (self._stream.ends and lines.fault == "has ended"):
+            raise SourceFault(f"{self.name}: {lines.fault}")
+
+    def stop(self) -> None:
+        """Let the lines end."""
+        if self._lines is not None:
+            self._lines.is_stopped = True
+
+    def _parsed(self, lines: Lines) -> Iterator[Arrival]:
+        board, first = self._recognised(lines)
+        if board is None:
+            yield from self._of_csv(lines, first)
+            return
+        feed, n_zones = _Fed(lines, first), math.prod(self._shape)
+        log = prints.BoardLog(cast(Any, feed), self._path, n_zones, is_live=True)
+        log.others = {other.name: other.line for other in BOARDS.values() if other.line is not board.line}
+        while not lines.fault and not lines.is_stopped:
+            n_damaged = log.n_damaged
+            try:
+                for printed in board.parse(log):
+                    if log.n_damaged > n_damaged:
+                        self.spoilt(log.first_damage or "")
+                        n_damaged, log.first_damage = log.n_damaged, None
+                    yield from self._taken(self._of_board(board, printed), lines)
+            except InputFileError as error:  # the line of another board: what has begun is lost, and the next is read
+                self.spoilt(str(error))
+            log.frame = None
+
+    def _recognised(self, lines: Lines) -> tuple[Board | None, list[bytes]]:
+        """Return the board whose lines arrive and the lines so far; None of lines of CSV."""
+        if self._named is not None and self._named in BOARDS:
+            return BOARDS[self._named], []
+        held: list[bytes] = []
+        n_pixels = math.prod(self._shape) * len(self._sensor.frequencies_hz)
+        while line := lines.readline(_LONGEST_LINE):
+            held.append(line)
+            board = find_board(self._named, b"".join(held), math.prod(self._shape), self._path)
+            if board is not None:
+                return board, held
+            text = prints.plain(line)
+            if _HEADER.search(text) or len(re.split(r"[;,\t]+", text.strip())) >= n_pixels:
+                return None, [line]
+            if len(held) == _UNRECOGNISED_LINES:
+                break
+        if lines.is_stopped or lines.fault:
+            return None, []
+        raise SourceFault(
+            f"{self.name}: {len(held)} lines are of no known format, the last {prints.plain(held[-1])[:40]!r}: give"
+            " board=…, or lines of JSON or CSV"
+        )
+
+    def _of_board(self, board: Board, printed: prints.Printed) -> Recording:
+        n_zones = math.prod(self._shape)
+        if len(printed.distance_mm) != n_zones:
+            raise InputFileError(
+                f"{self.name}: a frame of {len(printed.distance_mm)} zones, but the sensor has {self._shape[0]} ×"
+                f" {self._shape[1]}"
+            )
+        times = [] if printed.time_s is None else [printed.time_s]
+        return recording_of(board, printed.distance_mm, printed.status, times, self._sensor, self._shape)
+
+    def _of_csv(self, lines: Lines, first: list[bytes]) -> Iterator[Arrival]:
+        """Yield the frames of lines of CSV, below a header or without one."""
+        pending = list(first)
+        while line := pending.pop() if pending else lines.readline(_LONGEST_LINE):
+            text = prints.plain(line)
+            if _HEADER.search(text):
+                self._header = line
+            elif text.strip() and not text.startswith("#"):
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")  # of columns that are ignored, at every line
+                        row = parse_csv(self._header + line, self._shape, self._path, len(self._sensor.frequencies_hz))
+                except InputFileError as error:
+                    self.spoilt(str(error))
+                    continue
+                yield from self._taken(row, lines)
+
+    def _taken(self, row: Recording, lines: Lines) -> Iterator[Arrival]:
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of single ranges that cannot be
+                frames = frames_of(row, self._path, sensor=self._sensor, **self._how)
+        except InputFileError as error:
+            self.spoilt(str(error))
+            return
+        yield Arrival(frames, lines.received_s)
+
+
+class _Fed:
+    """Lines that were read to recognise a board, and those that follow."""
+
+    def __init__(self, lines: Lines, first: list[bytes]) -> None:
+        self._lines, self._first = lines, first[::-1]
+
+    def readline(self, limit: int) -> bytes:
+        """Return the next line."""
+        return self._first.pop() if self._first else self._lines.readline(limit)
+
+
+class Tmf8829Source(Source):
+    """Results of a TMF8829 as the ZeroMQ server of ams OSRAM's driver publishes them (protocol version 2).
+
+    A message has a header of 84 bytes, and frames behind one another: five bytes of the host, a header of 16, the zones
+    row by row and a footer of 12. Distances are in quarters of a millimetre, of one peak or several, the first of which
+    counts. Its clock has no documented unit, so frames are stamped when they arrive.
+    """
+
+    _CONTAINER, _MAGIC = 84, 0xFE5E1234
+    _HOST, _HEADER_BYTES, _FOOTER = 5, 16, 12
+    _RESULTS, _END, _IS_VALID = 0x10, 0xE0F7, 0x01
+
+    def __init__(self, name: str, sensor: Sensor, how: Mapping[str, Any]) -> None:
+        super().__init__(name)
+        self._zmq = needed("zmq", "ZeroMQ", "live")
+        host, port = address_of(name)
+        self._address = f"tcp://{host or '127.0.0.1'}:{port}"
+        self._sensor, self._stopped = sensor, False
+        self._how = {key: value for key, value in how.items() if key != "board"}
+        self._shape = shape_before(sensor, int(how.get("rotate", 0)))
+
+    def frames(self) -> Iterator[Arrival]:
+        """Subscribe, and yield frames."""
+        socket = self._zmq.Context.instance().socket(self._zmq.SUB)
+        socket.setsockopt(self._zmq.LINGER, 0)
+        socket.setsockopt(self._zmq.SUBSCRIBE, b"")
+        try:
+            socket.connect(self._address)
+            since = time.monotonic()
+            while not self._stopped:
+                if not socket.poll(50):
+                    if time.monotonic() - since > STALLS_AFTER_S:
+                        raise SourceFault(f"{self.name}: has sent nothing for {STALLS_AFTER_S:g} s")
+                    continue
+                message, since = socket.recv(), time.monotonic()
+                try:
+                    yield Arrival(
+                        frames_of(self._row(message), Path(self.name), sensor=self._sensor, **self._how), since
+                    )
+                except InputFileError as error:
+                    self.spoilt(str(error))
+        finally:
+            socket.close()
+
+    def stop(self) -> None:
+        """Let the wait for the next message end."""
+        self._stopped = True
+
+    def _row(self, message: bytes) -> Recording:
+        """Return the ranges of a message."""
+        if len(message) < self._CONTAINER or struct.unpack_from("<I", message)[0] != self._MAGIC:
+            raise InputFileError(f"{self.name}: a message of {len(message)} bytes is none of a TMF8829")
+        at, n = self._CONTAINER, math.prod(self._shape)
+        while at + self._HOST + self._HEADER_BYTES <= len(message):
+            kind, layout, payload = struct.unpack_from("<BBH", message, at + self._HOST)
+            end = at + self._HOST + 4 + payload
+            if kind & 0xF0 == self._RESULTS:
+                first = at + self._HOST + self._HEADER_BYTES
+                size = (layout & 7) * (5 if layout & 8 else 3) + (2 if layout & 16 else 0) + (2 if layout & 32 else 0)
+                if end > len(message) or first + n * size + self._FOOTER != end or not layout & 7:
+                    raise InputFileError(f"{self.name}: a frame of {end - first} bytes is none of {n} zones")
+                status, _, mark = struct.unpack_from("<BBH", message, end - 4)
+                if mark != self._END or not status & self._IS_VALID:
+                    raise InputFileError(f"{self.name}: a frame that its sensor takes for invalid")
+                zones = np.frombuffer(message, np.uint8, n * size, first).reshape(n, size)
+                skip = (2 if layout & 16 else 0) + (2 if layout & 32 else 0)
+                quarters = zones[:, skip].astype(np.float64) + 256.0 * zones[:, skip + 1]
+                return Recording({"range": quarters[None] / 4}, {"unit": "mm", "quantity": "range"}, flat=True)
+            at = end
+        raise InputFileError(f"{self.name}: a message without results")
+
+
+class RecordedSource(Source):
+    """Recording whose frames come in the rhythm of their stamps, or as fast as they are taken.
+
+    Parameters
+    ----------
+    path : Path
+    sensor : Sensor
+    how : mapping
+        Keywords of :func:`~phasemark.data.read_frames`.
+    in_time : bool
+    """
+
+    is_live = False
+
+    def __init__(self, path: Path, sensor: Sensor, how: Mapping[str, Any], *, in_time: bool) -> None:
+        super().__init__(str(path))
+        self._recorded = read_frames(path, sensor=sensor, untrusted=True, **how).each_a_position()
+        self._in_time, self._stopped = in_time, False
+
+    def frames(self) -> Iterator[Arrival]:
+        """Yield the frames."""
+        stamps = self._recorded.time_s
+        began = time.monotonic()
+        for k in range(len(self._recorded)):
+            if self._in_time:
+                period = 1 / (self._recorded.sensor.frame_rate_hz or 15.0)
+                due = began + (k * period if stamps is None else float(stamps[k, 0] - stamps[0, 0]))
+                while not self._stopped and time.monotonic() < due:
+                    time.sleep(min(max(due - time.monotonic(), 0.0), 0.05))
+            if self._stopped:
+                return
+            yield Arrival(self._recorded[k : k + 1], time.monotonic())
+
+    def stop(self) -> None:
+        """Let the frames end."""
+        self._stopped = True
+
+
+def open_source(name: str, sensor: Sensor, how: Mapping[str, Any] | None = None, *, in_time: bool = True) -> Source:
+    """Return the source that a name stands for.
+
+    Parameters
+    ----------
+    name : str
+        ``/dev/ttyUSB0``, ``serial:///dev/ttyUSB0?baud=921600``, ``-`` (standard input), ``tcp://host:port``,
+        ``udp://:port``, ``zmq://host:port`` (TMF8829), a recording, or a log in MCAP that a sink wrote.
+    sensor : Sensor
+        The camera.
+    how : mapping, optional
+        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean, `board` among them.
+    in_time : bool
+        Whether frames of a recording come in the rhythm of their stamps.
+
+    Raises
+    ------
+    UsageError
+        There is no source of this name, or a package is missing.
+    InputFileError
+        A recording cannot be read.
+    """
+    how = how or {}
+    if how.get("board") is not None and how["board"] not in BOARDS:
+        raise UsageError(f"board=… must be one of {', '.join(BOARDS)}, got {how['board']!r}")
+    stream = open_stream(name)
+    if stream is not None:
+        return PrintedSource(stream, sensor, how)
+    if name.startswith("zmq://"):
+        return Tmf8829Source(name, sensor, how)
+    if "://" in name:
+        raise UsageError(f"{name}: a source must begin with serial://, tcp://, udp:// or zmq://, or be a file")
+    if Path(name).suffix == ".mcap":
+        from phasemark.matcher.live.mcap_log import McapSource
+
+        return McapSource(Path(name), sensor, in_time=in_time)
+    return RecordedSource(Path(name), sensor, how, in_time=in_time)
+
+
+def _reason(error: OSError) -> str:
+    return getattr(error, "strerror", None) or " ".join(str(error).split())[:120] or type(error).__name__
