@@ -319,6 +319,11 @@ class Matcher:
             frames = frames.with_chip_error()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether a search of a frame renders nothing: some milliseconds, so that tracking saves no time."""
+        return not self._by_evidence and self._direct is None and getattr(self._method, "is_quick", False)
+
     def track(self, frames: FilteredFrames, near: Sequence[Match]) -> Match:
         """Match one frame from the views that are expected of it: no search, and no look for rivals elsewhere.
 

@@ -156,7 +156,7 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
     # a speed that changes within a second from rest to the fastest
     turn = math.radians(motion.turn_rate)
     free = FreeMotion(motion.speed / 2, motion.speed, turn / 2, turn)
-    estimator = PoseEstimator(Standing(flat=motion.flat), free)
+    estimator = PoseEstimator(Standing(flat=motion.flat), free, jitter_s=bank.sensor.systematic_time_s)
     every = 30  # frames of a recording between two searches
     searches: Any = SearchesBeside(matcher) if source.is_live else SearchesInLine(matcher, every)
     if isinstance(source, McapSource):

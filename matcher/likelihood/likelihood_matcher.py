@@ -171,6 +171,11 @@ class LikelihoodMatcher:
         """Rules by which an answer is accepted."""
         return self._setup.rules
 
+    @property
+    def is_quick(self) -> bool:
+        """Whether a search renders nothing, for the images of the bank are fine enough."""
+        return self._exact is not None and not self._auto
+
     def track(self, frames: FilteredFrames, near: Sequence[Match]) -> Match:
         """Match one filtered frame from expected views alone, before an expected background.
 

@@ -70,7 +70,8 @@ class Tracker:
 
     A frame is matched from the views that are expected of it: those of all poses that are followed. A full search runs
     in turn beside that, and at once while nothing is expected or that fails. A view that it finds elsewhere is one that
-    the next frame is matched from, too, and wins if it explains that frame better.
+    the next frame is matched from, too, and wins if it explains that frame better. Where
+    a search renders nothing, every frame is searched.
 
     Parameters
     ----------
@@ -119,6 +120,9 @@ class Tracker:
         note = self._move(stamp_s, reading)
         filtered = kalman_filter(frames)
         expected = self._expected()
+        if self.matcher.is_quick:
+            match = self.matcher.match(filtered)[0]
+            return Located(self.estimator.see(match), match, filtered, note=note)
         match = self.matcher.track(filtered, expected) if expected else None
         tracked = match is not None and match.reason in _SHOWS_IT
         self._tracked_s = stamp_s if tracked else self._tracked_s

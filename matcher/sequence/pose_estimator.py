@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,8 @@ class PoseEstimator:
         Three standard deviations of an accepted pose: towards the landmark, and as an angle about it and of heading.
     lost_after_s : float
         Without a match for longer, the pose is lost.
+    jitter_s : float
+        Standard deviation of the frames' stamps: what it makes of the motion is added to the noise of a match.
 
     Examples
     --------
@@ -118,10 +120,11 @@ class PoseEstimator:
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         lost_after_s: float = 0.5,
+        jitter_s: float = 0.0,
     ) -> None:
         self.standing = standing
         self._motion, self._gate, self._lost_after_s = motion, gate, lost_after_s
-        self._tolerance = tolerance_m, tolerance_rad
+        self._tolerance, self._jitter_s = (tolerance_m, tolerance_rad), jitter_s
         self._tracks: list[_Track] = []
 
     @property
@@ -162,7 +165,11 @@ class PoseEstimator:
         found: list[_Track] = []
         fits = False
         for track in self._tracks:
+            if self.standing.view(track.filter.pose)[0] <= 0:  # it has drifted to behind the landmark
+                continue
+            late = self._jitter_s * track.filter.rate
             for sighting in self.standing.sightings(match, track.filter.pose):
+                sighting = replace(sighting, covariance=sighting.covariance + np.outer(late, late))
                 squared, log_density = track.filter.distance(sighting)
                 if track.filter.passes(sighting, squared):
                     fits, moved = True, track.filter.copy()

@@ -116,6 +116,8 @@ class PoseFilter:
         self._gate = gate
         self._steps: _Step | None = None
         self._jacobian, self._predicted = np.eye(n), (self.state, self.covariance)
+        self.rate: _Floats = np.zeros(POSE)
+        """How fast the pose changed in the last prediction, per second."""
 
     @property
     def pose(self) -> _Floats:
@@ -139,6 +141,10 @@ class PoseFilter:
         jacobian, noise = np.eye(len(self.state)), np.zeros_like(self.covariance)
         after, jacobian[:m, :m], noise[:m, :m] = self._model.step(self.state[:m], reading)
         self.covariance = jacobian @ self.covariance @ jacobian.T + noise
+        change = after[:POSE] - self.pose
+        change[2] = math.remainder(change[2], math.tau)
+        if reading.time_s > 0:
+            self.rate = change / reading.time_s
         self.state = np.concatenate([after, self.state[m:]])
         self._jacobian, self._predicted = jacobian @ self._jacobian, (self.state, self.covariance)
 

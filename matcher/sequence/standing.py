@@ -33,8 +33,8 @@ class Standing:
     pan_offset_xy_m, lens_offset_xy_m : (x, y)
         As :func:`~phasemark.matcher.robot_poses` has them.
     flat : bool
-        Whether the landmark is a wide plane across the x axis, which does not show where along it the camera stands:
-        x and the heading are then all that is measured.
+        Whether the landmark is a wide plane across the x axis, of yaw 0, which does not show where along it the camera
+        stands: x and the heading are then all that is measured.
     one_side : bool
         Whether a symmetric landmark is taken to be seen first from the side that δ = 0 faces, within half a period, as
         is right where its own frame is all that matters. Otherwise every side is a pose of its own.
@@ -54,8 +54,14 @@ class Standing:
         return (0, 2) if self.flat else (0, 1, 2)
 
     def view(self, pose: NDArray[np.float64]) -> tuple[float, float, float]:
-        """Return (D, δ, b) of the landmark seen from a pose of the robot, (x, y, heading)."""
+        """Return (D, δ, b) of the landmark seen from a pose of the robot, (x, y, heading).
+
+        Of a wide plane that is the view of the point that the optical axis meets.
+        """
         lens = lens_pose(pose, self.pan_rad, self.pan_offset_xy_m, self.lens_offset_xy_m)
+        if self.flat:
+            axis = float(lens[2])
+            return float(self.landmark_xy_m[0] - lens[0]) / max(math.cos(axis), 0.1), axis, 0.0
         return view_of(lens, self.landmark_xy_m, self.landmark_yaw_rad)
 
     def sightings(self, match: Match, about: NDArray[np.float64] | None = None) -> list[Sighting]:
