@@ -51,9 +51,8 @@ def test_filter_and_smoother_are_batch_least_squares():
         robot.predict(Reading(0.0, 0.0, STEP_S))
         robot.take(Sighting(measured[k], covariance, loading))
         robot.mark()
-        own = slice(6 * k, 6 * k + 6)
         rows = np.zeros((6, size))
-        rows[:, own] = np.eye(6)
+        rows[:, 6 * k : 6 * k + 6] = np.eye(6)
         if k:
             rows[:, 6 * k - 6 : 6 * k] = -jacobian
         weight = np.linalg.inv(noise if k else prior)
@@ -65,7 +64,7 @@ def test_filter_and_smoother_are_batch_least_squares():
     information[-3:, -3:] += np.eye(3)
     best, whole = np.linalg.solve(information, right), np.linalg.inv(information)
     for k, (state, spread) in enumerate(robot.smoothed()):
-        own = [*range(6 * k, 6 * k + 6), *range(size - 3, size)]
+        own = np.array([*range(6 * k, 6 * k + 6), *range(size - 3, size)])
         np.testing.assert_allclose(state, best[own], atol=1e-10)
         np.testing.assert_allclose(spread, whole[np.ix_(own, own)], atol=1e-10)
     np.testing.assert_allclose(robot.pose, best[size - 9 : size - 6], atol=1e-10)
@@ -120,6 +119,7 @@ def test_mirror_rivals_are_kept_apart_until_motion_decides():
     assert said[0].reason == "ambiguous"
     assert len(said[0].poses) == 2
     assert said[-1].accepted
+    assert said[-1].pose is not None
     assert said[-1].pose[2] == pytest.approx(delta, abs=0.03)
     assert not any(one.accepted and abs(one.pose[2] - 0.3 - 0.02 * k) > 0.1 for k, one in enumerate(said))
 

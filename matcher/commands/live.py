@@ -158,7 +158,8 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
     free = FreeMotion(motion.speed / 2, motion.speed, turn / 2, turn)
     estimator = PoseEstimator(Standing(flat=motion.flat), free, jitter_s=bank.sensor.systematic_time_s)
     every = 30  # frames of a recording between two searches
-    searches: Any = SearchesBeside(matcher) if source.is_live else SearchesInLine(matcher, every)
+    beside = source.is_live and not matcher.is_quick
+    searches: Any = SearchesBeside(matcher) if beside else SearchesInLine(matcher, every)
     if isinstance(source, McapSource):
         searches = SearchesAsLogged(matcher, source.searches())
     return Tracker(

@@ -90,9 +90,9 @@ class Source(ABC):
     def stop(self) -> None:  # noqa: B027  a source may end by itself
         """Let :meth:`frames` end soon; called from another thread."""
 
-    def spoilt(self, damage: str) -> None:
-        """Count a frame that is left out."""
-        self.n_damaged, self.damage = self.n_damaged + 1, damage
+    def spoilt(self, damage: str, n: int = 1) -> None:
+        """Count frames that are left out."""
+        self.n_damaged, self.damage = self.n_damaged + n, damage
 
 
 class PrintedSource(Source):
@@ -150,7 +150,7 @@ class PrintedSource(Source):
             try:
                 for printed in board.parse(log):
                     if log.n_damaged > n_damaged:
-                        self.spoilt(log.first_damage or "")
+                        self.spoilt(log.first_damage or "", log.n_damaged - n_damaged)
                         n_damaged, log.first_damage = log.n_damaged, None
                     yield from self._taken(self._of_board(board, printed), lines)
             except InputFileError as error:  # the line of another board: what has begun is lost, and the next is read

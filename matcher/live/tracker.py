@@ -121,8 +121,8 @@ class Tracker:
         filtered = kalman_filter(frames)
         expected = self._expected()
         if self.matcher.is_quick:
-            match = self.matcher.match(filtered)[0]
-            return Located(self.estimator.see(match), match, filtered, note=note)
+            answer = self.matcher.match(filtered)[0]
+            return Located(self.estimator.see(answer), answer, filtered, note=note)
         match = self.matcher.track(filtered, expected) if expected else None
         tracked = match is not None and match.reason in _SHOWS_IT
         self._tracked_s = stamp_s if tracked else self._tracked_s
