@@ -80,6 +80,7 @@ SOURCES = {
     "direct_error.png": ("examples/direct_sensor.py",),
     "direct_histograms.png": ("examples/direct_sensor.py",),
     "locate.png": ("docs/figures.py", "docs/locate.md", "matcher/locate/figures.py", "render/charts.py"),
+    "live_docking.png": ("examples/live_docking.py",),
     "multipath.png": ("docs/figures.py", "docs/multipath.md", "render/figures.py"),
     "scenes.png": ("docs/figures.py", "docs/scenes.md", "render/figures.py"),
     "drive.png": ("matcher/drive/plan.toml", "matcher/drive/figures.py", "render/charts.py"),
