@@ -2,9 +2,9 @@
 
 ``python examples/live_docking.py --out out/docking``
 
-The board prints lines of JSON into a pseudo-terminal, thirty a second, of what a TMF8829 sees from where the robot really
-is. The robot knows nothing but ``phasemark.matcher.live``: it drives to 0.45 m before the landmark, facing it, and stops
-while no pose is accepted. The figure has the way, and the error of the pose with three standard deviations over time.
+The board prints lines of JSON into a pseudo-terminal, thirty a second: what a TMF8829 sees from where the robot really
+is. The robot knows nothing but ``phasemark.matcher.live``: it drives to 0.45 m before the landmark, facing it, and
+stops while no pose is accepted. The figure has the way, and errors with three standard deviations over time.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class Robot:
 
 
 def dock(most_s: float) -> tuple[Robot, dict[int, np.ndarray], dict[str, Any]]:
-    """Drive until the robot is docked; return it, the true poses by stamp in milliseconds, and the status of the session."""
+    """Drive until the robot is docked; return it, the true poses by stamp in milliseconds, and the status."""
     own, other = pty.openpty()
     tty.setraw(own)
     tty.setraw(other)
@@ -184,7 +184,8 @@ def main(argv: list[str] | None = None) -> int:
     error = np.array([own[1] - truth[round(1e3 * own[0])] for own in robot.seen])
     squared = np.array([e @ np.linalg.solve(own[2], e) for e, own in zip(error, robot.seen, strict=True)])
     x, y, heading = np.sqrt(np.mean(error**2, axis=0))
-    print(f"docked: {'yes' if robot.is_docked else 'no'}, {len(robot.seen)} poses, accepted {status['accepted_share']:.0%}")
+    answer = "yes" if robot.is_docked else "no"
+    print(f"docked: {answer}, {len(robot.seen)} poses, accepted {status['accepted_share']:.0%}")
     print(f"r.m.s. of x, y, heading: {1e3 * x:.1f} mm, {1e3 * y:.1f} mm, {math.degrees(heading):.2f}°")
     print(f"mean NEES / 3: {squared.mean() / 3:.2f}; latency {status['latency_ms']} ms, {status['dropped']} dropped")
     arguments.out.mkdir(parents=True, exist_ok=True)

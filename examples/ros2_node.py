@@ -2,8 +2,8 @@
 
 ``python examples/ros2_node.py /dev/ttyUSB0 bank.h5 --name dock``
 
-Another computer of the same ROS_DOMAIN_ID lists ``/dock/pose`` and ``/dock/landmark_pose``, and Nav2's docking server takes
-the latter. What is not accepted is not published: a consumer needs a timeout, and finds why in ``/dock/status``.
+Topics are ``/dock/pose``, ``/dock/landmark_pose`` and ``/dock/status`` in the domain ROS_DOMAIN_ID. What is not accepted
+is not published: a consumer needs a timeout, and finds why in the status.
 """
 
 from __future__ import annotations

@@ -602,3 +602,11 @@ def test_the_simulated_recording_is_what_its_command_writes(tmp_path):
     rows = [[[cell or "nan" for cell in line.split(",")[:129]] for line in lines[2:]] for lines in (here, there)]
     values = np.array(rows, np.float64)
     np.testing.assert_allclose(values[0], values[1], atol=1.5)  # another processor may round a millimetre apart
+
+
+def test_a_robot_docks_by_poses_of_a_board_in_a_second_process(tmp_path, capsys):
+    docking = runpy.run_path(str(EXAMPLE.with_name("live_docking.py")))
+    assert docking["main"](["--out", str(tmp_path), "--most", "60"]) == 0
+    said = capsys.readouterr().out
+    assert "docked: yes" in said
+    assert (tmp_path / "docking.png").stat().st_size > 10_000
