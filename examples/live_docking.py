@@ -139,7 +139,9 @@ def dock(most_s: float) -> tuple[Robot, dict[int, np.ndarray], dict[str, Any]]:
     session.run(on_update=update)
     stop.cancel()
     process.kill()
-    process.wait()
+    process.communicate()
+    for end in (own, other):
+        os.close(end)
     return robot, truth, session.status.as_dict()
 
 

@@ -2,8 +2,8 @@
 
 ``python examples/ros2_node.py /dev/ttyUSB0 bank.h5 --name dock``
 
-Topics are ``/dock/pose``, ``/dock/landmark_pose`` and ``/dock/status`` in the domain ROS_DOMAIN_ID. What is not accepted
-is not published: a consumer needs a timeout, and finds why in the status.
+Topics are ``/dock/pose``, ``/dock/landmark_pose`` and ``/dock/status`` in the domain ROS_DOMAIN_ID. What is not
+accepted is not published: a consumer needs a timeout, and finds why in the status.
 """
 
 from __future__ import annotations

@@ -162,3 +162,14 @@ def test_of_a_wide_plane_only_distance_and_heading_are_measured():
     assert found.pose is not None
     assert found.pose[0] == pytest.approx(-math.cos(0.3))
     assert found.covariance[1, 1] > 1
+
+
+def test_of_a_symmetric_landmark_the_side_that_is_expected_is_followed():
+    estimator, period = PoseEstimator(Standing(), FreeMotion(0.1, 0.5, 0.3, 3.0), lost_after_s=5.0), math.pi
+    for k in range(12):
+        estimator.move(Reading(0.0, 0.0, 0.5 if k == 6 else STEP_S))  # a gap after which either side is probable
+        delta = 1.47 + 0.012 * k  # beyond half a period in the end
+        found = estimator.see(match_of((1.0, delta % period, 0.0), symmetry=2))
+        assert found.accepted
+        assert found.pose is not None
+        assert found.pose[2] == pytest.approx(delta, abs=0.03)

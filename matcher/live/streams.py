@@ -57,6 +57,7 @@ class SerialStream(Stream):
     def open(self) -> None:
         """Open the port."""
         self._port = self._serial.Serial(self._path, self._baud, timeout=_WAIT_S)
+        self._port.reset_input_buffer()  # what came before is old
 
     def read(self) -> bytes | None:
         """Return what has arrived."""

@@ -36,8 +36,9 @@ class Standing:
         Whether the landmark is a wide plane across the x axis, of yaw 0, which does not show where along it the camera
         stands: x and the heading are then all that is measured.
     one_side : bool
-        Whether a symmetric landmark is taken to be seen first from the side that δ = 0 faces, within half a period, as
-        is right where its own frame is all that matters. Otherwise every side is a pose of its own.
+        Whether a symmetric landmark is taken to be seen first from the side that δ = 0 faces, within half a period, and
+        then from the side that is nearest to what is expected, as is right where its own frame is all that matters.
+        Otherwise every side is a pose of its own.
     """
 
     landmark_xy_m: tuple[float, float] = (0.0, 0.0)
@@ -77,10 +78,11 @@ class Standing:
         """
         if about is not None and match.reason == "undetermined":
             return [self._about(match, about)]
-        found = []
+        found, expected_rad = [], 0.0 if about is None else self.view(about)[1]
         for one, share in _explanations(match):
-            if about is None and self.one_side:
-                one = replace(one, delta_rad=math.remainder(one.delta_rad, math.tau / one.symmetry), symmetry=1)
+            if self.one_side:
+                turn = math.remainder(one.delta_rad - expected_rad, math.tau / one.symmetry)
+                one = replace(one, delta_rad=expected_rad + turn, symmetry=1)
             for pose in self._poses(one):
                 at = np.array([pose.x_m, pose.y_m, pose.heading_rad])
                 found.append(self._sighting(one, pose, at, math.log(share / one.symmetry)))
