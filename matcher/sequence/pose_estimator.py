@@ -93,6 +93,8 @@ class PoseEstimator:
         Three standard deviations of an accepted pose: towards the landmark, and as an angle about it and of heading.
     lost_after_s : float
         Without a match for longer, the pose is lost.
+    delay_std_s : float
+        Standard deviation of the delay of the recording's stamps against the odometry's, which is estimated.
     jitter_s : float
         Standard deviation of the frames' stamps: what it makes of the motion is added to the noise of a match.
 
@@ -120,11 +122,12 @@ class PoseEstimator:
         tolerance_m: float = TOLERANCE_M,
         tolerance_rad: float = TOLERANCE_RAD,
         lost_after_s: float = 0.5,
+        delay_std_s: float = 0.0,
         jitter_s: float = 0.0,
     ) -> None:
         self.standing = standing
         self._motion, self._gate, self._lost_after_s = motion, gate, lost_after_s
-        self._tolerance, self._jitter_s = (tolerance_m, tolerance_rad), jitter_s
+        self._tolerance, self._jitter_s, self._delay_std_s = (tolerance_m, tolerance_rad), jitter_s, delay_std_s
         self._tracks: list[_Track] = []
 
     @property
@@ -167,9 +170,7 @@ class PoseEstimator:
         for track in self._tracks:
             if self.standing.view(track.filter.pose)[0] <= 0:  # it has drifted to behind the landmark
                 continue
-            late = self._jitter_s * track.filter.rate
-            for sighting in self.standing.sightings(match, track.filter.pose):
-                sighting = replace(sighting, covariance=sighting.covariance + np.outer(late, late))
+            for sighting in self._timed(match, track.filter):
                 squared, log_density = track.filter.distance(sighting)
                 if track.filter.passes(sighting, squared):
                     fits, moved = True, track.filter.copy()
@@ -181,14 +182,28 @@ class PoseEstimator:
                 found.append(_Track(track.filter, missed, track.unseen_s))
         if not fits and match.reason != "undetermined":
             share = math.log(_ELSEWHERE if found else 1.0)
-            for sighting in self.standing.sightings(match):
+            for sighting in self._timed(match, None):
                 found.append(_Track(self._born(sighting), share + anywhere + sighting.log_weight, 0.0, True, 0.0))
         return found
+
+    def _timed(self, match: Match, expected: PoseFilter | None) -> list[Sighting]:
+        """Return the poses that a match allows, with what errors of its stamp make of the motion."""
+        rate = np.zeros(POSE) if expected is None else expected.rate
+        late = self._jitter_s * rate
+        return [
+            replace(
+                one,
+                covariance=one.covariance + np.outer(late, late),
+                loading=np.column_stack([one.loading, self._delay_std_s * rate]),
+            )
+            for one in self.standing.sightings(match, None if expected is None else expected.pose)
+        ]
 
     def _born(self, sighting: Sighting) -> PoseFilter:
         """Return a filter that knows a measured pose alone."""
         unknown = np.eye(POSE) * _NOTHING_KNOWN**2
-        new = PoseFilter(sighting.pose, unknown, self._motion, self._gate, shares_errors=bool(sighting.loading.any()))
+        n_shared = sighting.loading.shape[1] if sighting.loading.any() or self._delay_std_s else 0
+        new = PoseFilter(sighting.pose, unknown, self._motion, self._gate, n_shared=n_shared)
         new.take(sighting)
         return new
 

@@ -43,7 +43,7 @@ class Sighting:
         x, y and heading, metres and radians.
     covariance : (3, 3) float64
         Of its own noise.
-    loading : (3, 3) float64
+    loading : (3, k) float64
         What errors that all frames of a recording share move it by, per standard deviation of each: L Lᵀ is their
         covariance.
     rows : tuple of int
@@ -74,7 +74,7 @@ class PoseFilter:
 
     Odometry drives the prediction; a measured pose with its covariance corrects it, unless the gate finds it too
     improbable. Slip and bias are corrected too, through what the prediction has tied them to. So is the bias of the
-    recording: errors that all frames share are three further numbers of the state, which stay as they are.
+    recording: errors that all frames share are further numbers of the state, which stay as they are.
 
     Parameters
     ----------
@@ -86,8 +86,8 @@ class PoseFilter:
         How the pose moves, such as the errors of wheels and gyro.
     gate : float
         Measurements as improbable as 1 − gate are refused.
-    shares_errors : bool
-        Whether the state has the bias of the recording.
+    n_shared : int
+        How many numbers of the state are the bias of the recording.
 
     Attributes
     ----------
@@ -104,10 +104,10 @@ class PoseFilter:
         model: Motion,
         gate: float,
         *,
-        shares_errors: bool = False,
+        n_shared: int = 0,
     ) -> None:
         moving = model.start(pose_covariance)
-        self._moving, n = len(moving), len(moving) + (POSE if shares_errors else 0)
+        self._moving, n = len(moving), len(moving) + n_shared
         self.state: _Floats = np.zeros(n)
         self.state[:POSE] = pose
         self.covariance: _Floats = np.eye(n)
