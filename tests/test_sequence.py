@@ -95,6 +95,19 @@ def test_poses_of_simulated_drives_are_as_uncertain_as_stated():
     assert accepted > 0.9 * n
 
 
+def test_smoothed_poses_of_a_drive_are_nearer_to_the_truth_than_filtered_ones():
+    rng, motion = np.random.default_rng(11), FreeMotion(0.0, 0.05, 0.0, 0.1)
+    estimator = PoseEstimator(Standing(), motion, smooths=True)
+    poses, causal = wander(rng, 80, motion), []
+    for pose in poses:
+        estimator.move(Reading(0.0, 0.0, STEP_S))
+        view = estimator.standing.view(pose) + rng.multivariate_normal(np.zeros(3), NOISE)
+        causal.append(estimator.see(match_of(view, shared=None)).pose)
+    smooth = np.array([state[:3] for state, _ in estimator.filter.smoothed()])
+    off, kept = (np.sqrt(np.mean((own[10:-10] - poses[10:-10]) ** 2, axis=0)) for own in (np.array(causal), smooth))
+    assert (kept < 0.8 * off).all()
+
+
 def test_a_recording_s_bias_does_not_average_out():
     estimator = PoseEstimator(Standing(), FreeMotion(0.0, 1e-4, 0.0, 1e-4))
     for _ in range(200):
@@ -152,6 +165,17 @@ def test_it_states_that_it_searches_is_lost_and_has_found_itself_again():
         reasons.append(estimator.see(None).reason)
     assert reasons[-1] == "lost"
     assert estimator.see(match_of((1.3, 2.0, 0.0))).accepted
+
+
+def test_matches_whose_bearing_is_fixed_may_go_on_for_long():
+    """Their poses have covariances of rank two."""
+    estimator = PoseEstimator(Standing(), FreeMotion(0.2, 0.5, 0.3, 0.5))
+    for k in range(400):
+        estimator.move(Reading(0.0, 0.0, STEP_S))
+        view = (1.0 + 0.05 * math.sin(k / 9), 0.3 + 0.1 * math.sin(k / 7), 0.0)
+        seen = replace(match_of(view), free=FREE[:2], covariance=NOISE[:2, :2], systematic={})
+        found = estimator.see(seen)
+    assert found.accepted
 
 
 def test_of_a_wide_plane_only_distance_and_heading_are_measured():

@@ -97,6 +97,8 @@ class PoseEstimator:
         Standard deviation of the delay of the recording's stamps against the odometry's, which is estimated.
     jitter_s : float
         Standard deviation of the frames' stamps: what it makes of the motion is added to the noise of a match.
+    smooths : bool
+        Whether every step is kept, so that poses can be smoothed at the end: memory grows with the time.
 
     Examples
     --------
@@ -124,15 +126,17 @@ class PoseEstimator:
         lost_after_s: float = 0.5,
         delay_std_s: float = 0.0,
         jitter_s: float = 0.0,
+        smooths: bool = False,
     ) -> None:
         self.standing = standing
         self._motion, self._gate, self._lost_after_s = motion, gate, lost_after_s
         self._tolerance, self._jitter_s, self._delay_std_s = (tolerance_m, tolerance_rad), jitter_s, delay_std_s
         self._tracks: list[_Track] = []
+        self._smooths = smooths
 
     @property
     def filter(self) -> PoseFilter | None:
-        """The filter of the most probable pose, whose `smoothed` has all poses up to now."""
+        """The filter of the most probable pose; with `smooths` its method `smoothed` returns all poses up to now."""
         return self._tracks[0].filter if self._tracks else None
 
     def expected_views(self) -> list[tuple[float, float, float]]:
@@ -158,7 +162,7 @@ class PoseEstimator:
         else:
             for track in self._tracks:
                 track.used, track.distance_squared = False, math.nan
-        for track in self._tracks:
+        for track in self._tracks if self._smooths else ():
             track.filter.mark()
         return self._estimate()
 

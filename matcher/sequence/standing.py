@@ -17,6 +17,8 @@ from phasemark.matcher.sequence.pose_filter import Sighting
 _VIEW = ("distance_m", "delta_rad", "bearing_rad")
 _SHARED = ("calibration", "recording", "declared")
 """Parts of a match's covariance that are the same error in all frames of a recording."""
+_LEAST_VARIANCE = 1e-10
+"""Variance that is added to each number of a pose, m² or rad²: where the bearing is fixed, they are not independent."""
 _LEAST_SHARE, _MOST_RIVALS = 1e-3, 4
 """Least probability of a rival of an ambiguous match, which one frame cannot exclude, and how many rivals are kept."""
 
@@ -133,7 +135,8 @@ class Standing:
         values, vectors = np.linalg.eigh(shared)
         # the symmetric root changes with the view as little as the covariance does
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-        return Sighting(at, pose.covariance, self._jacobian(match, pose) @ root, self.rows, log_share)
+        noise = pose.covariance + _LEAST_VARIANCE * np.eye(3)
+        return Sighting(at, noise, self._jacobian(match, pose) @ root, self.rows, log_share)
 
 
 def _explanations(match: Match) -> Iterator[tuple[Match, float]]:
