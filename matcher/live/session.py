@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -16,8 +15,8 @@ from phasemark.render import Frames
 
 _RETRY_S = 0.2
 """Pause before a source is opened again."""
-_SETTLES_S = 0.3
-"""Stamps have to run forward for so long after a jump before a pose is published."""
+_SETTLES = 5
+"""Frames whose stamps have to run forward after a jump before a pose is published: two boards on a port never do."""
 _DRIFT = 1e-4
 """By how much the source's clock may run slow against ours, seconds a second."""
 
@@ -124,7 +123,7 @@ class Live:
         self._newest = _Newest(keeps_all=not source.is_live)
         self._number = -1
         self._offset_s: float | None = None
-        self._holds_until_s = -math.inf
+        self._held = 0
         self._to_unix_s = time.time() - time.monotonic()
 
     def stop(self) -> None:
@@ -205,11 +204,11 @@ class Live:
         stamp = received if stamps is None else float(stamps.flat[0])
         located = self.locator.locate(arrival.frames, stamp)
         if located.note:
-            self._holds_until_s, self._offset_s = stamp + _SETTLES_S, None
+            self._held, self._offset_s = _SETTLES, None
             self._say(f"{self.source.name}: {located.note}")
         reason = located.estimate.reason
-        if not reason and stamp < self._holds_until_s:
-            reason = "clock"
+        if self._held:
+            self._held, reason = self._held - 1, reason or "clock"
         latency_s = time.monotonic() - arrival.received_s
         self.status.dropped = self._newest.n_dropped
         self.status.damaged = self.source.n_damaged
