@@ -20,6 +20,7 @@ _TURN = 0.35
 _THIN, _SHORTER = 0.25, 0.4
 """Triangles lower than this share of their length are cut shorter, for their centroids to say where they are."""
 _EVEN = 1 + 1e-9
+"""Rounding of areas that are the same."""
 _DEEP = 0.2
 """Largest extent of a patch across its first facet, in sizes of the patch: surfaces in two planes are not joined."""
 _LIFT = 1e-5
@@ -340,7 +341,7 @@ def _points_of(
             along = np.argmax(np.ptp(centres[group], axis=0))
             order = group[np.argsort(centres[group, along], kind="stable")]
             upto = np.cumsum(areas[order])
-            middle = int(np.clip(np.searchsorted(upto, 0.5 * upto[-1]), 1, len(order) - 1))
+            middle = int(np.clip(np.searchsorted(upto, 0.5 * upto[-1] / _EVEN) + 1, 1, len(order) - 1))
             parts += [order[:middle], order[middle:]]
         groups = parts
     points, normals, weights = np.empty((POINTS, 3)), np.empty((POINTS, 3)), np.empty(POINTS)

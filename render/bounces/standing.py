@@ -54,6 +54,8 @@ _STEP_SHARE, _STEP_RAD = 0.09, math.radians(7.5)
 """Steps of the grid of nodes: of the logarithm of the distance, and of the angle δ."""
 _ALBEDOS = 0.5 - 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3)
 """Albedos of the floor at which nodes are computed: light is a polynomial in it, of which the square suffices."""
+_MOST_NODES = 2000
+"""Nodes that are kept, of 0.2 to 0.5 MB each."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
 _SMALL = 5e-3
@@ -224,6 +226,8 @@ class StandingLight:
                     node = self._solved(stand, self._node_view(view, distance_m, turn * _STEP_RAD, axis), bounces)
                     with self._lock:
                         self._nodes[name] = node
+                        if len(self._nodes) > _MOST_NODES:
+                            del self._nodes[next(iter(self._nodes))]
                 own = [values @ (weight * shares) for values in node]
                 found = own[0] if found is None else found + own[0]
                 at_sheets = own[1] if at_sheets is None else at_sheets + own[1]
