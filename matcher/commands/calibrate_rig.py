@@ -56,6 +56,8 @@ def calibrate_rig_file(
     rig = read_rig(rig_file)
     read = [read_rig_recording(path, rig) for path in recordings]
     maps, names = _maps(map_file, read)
+    beside = [out.with_name(f"{out.stem}-{name}.toml") for name in names] if "walls" in (free or ()) else []
+    refuse_existing(beside, force)
     with LongWork("calibrating the rig") as progress:
         found = calibrate_rig(rig, read, maps, _poses(poses, read), tuple(free or FREE), progress)
     if found.doubts and not write_distrusted:
@@ -64,8 +66,7 @@ def calibrate_rig_file(
             " (--write-distrusted writes it all the same)"
         )
     files = [write_file(out, found.rig.to_toml(), force)]
-    for (name, one), moved in zip(names.items(), found.wall_m, strict=False):
-        path = out.with_name(f"{out.stem}-{name}.toml")
+    for path, one, moved in zip(beside, names.values(), found.wall_m, strict=False):  # none if walls are not free
         files.append(write_file(path, one.with_walls_moved(moved[: len(one.walls)]).to_toml(), force))
     if as_json:
         echo_json({"files": [str(path) for path in files], **_as_dict(found)})

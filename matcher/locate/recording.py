@@ -153,6 +153,8 @@ def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
 def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an NPZ file."""
     content = read_whole(path, most_bytes=_MOST_BYTES)
+    if content[:2] != b"PK":
+        raise InputFileError(f"{path}: must be an NPZ file of arrays")
     try:
         with opened_npz(io.BytesIO(content), len(content), path) as archive:
             return {name: np.asarray(archive[name]) for name in archive}

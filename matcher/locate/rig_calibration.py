@@ -135,8 +135,8 @@ class _Problem:
                 f" {len(poses)} tables of poses"
             )
         self.rig, self.recordings, self.free = rig, recordings, free
-        self.maps = list(dict.fromkeys(wall_maps))
-        self.of_map = [self.maps.index(one) for one in wall_maps]
+        self.maps = list({id(one): one for one in wall_maps}.values())
+        self.of_map = [next(m for m, other in enumerate(self.maps) if other is one) for one in wall_maps]
         self.stops = [(r, k) for r, table in enumerate(poses) for k in range(len(table)) if np.isfinite(table[k]).all()]
         if len(self.stops) < _FEWEST_STOPS:
             raise UsageError(f"at least {_FEWEST_STOPS} stops must have a pose, got {len(self.stops)}")
