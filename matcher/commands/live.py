@@ -7,7 +7,7 @@ from __future__ import annotations
 import math
 import signal
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -152,6 +152,10 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
 
     if search.is_direct:
         raise UsageError(f"--on {search.on}: phasemark live follows ranges, reported ranges or phasors")
+    stated = search.on or search.auto_background or search.no_background or search.background
+    if bank.sensor.histogram is not None and not stated:
+        # ranges as a chip reports them take seconds to search: too long for a stream
+        search = replace(search, on="ranges", unknown_background=True)
     matcher = search.for_bank(bank).matcher(bank)
     # a speed that changes within a second from rest to the fastest
     turn = math.radians(motion.turn_rate)

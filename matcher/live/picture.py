@@ -46,7 +46,7 @@ class Pictures:
             residual_m = wrap_difference_m(update.located.filtered.range_m[0] - self._model(match), self._bank.sensor)
             residual_m = np.where(np.abs(residual_m) > _MOST_M, np.nan, residual_m)
             found["residual_mm"] = _plain(1e3 * (residual_m - self._bank.camera.range_offset_m))
-            found["match"] = {"class": match.class_name, "reason": match.reason, "chi2": _or_none(match.chi2)}
+            found["class"] = match.class_name
         return found
 
     def _model(self, match: Any) -> NDArray[np.float64]:

@@ -37,9 +37,6 @@ class Searches(Protocol):
     def answer(self, frame: int) -> Searched | None:
         """Return an answer that is to be used with a frame."""
 
-    def wait(self) -> None:
-        """Wait until a search can run."""
-
     def close(self) -> None:
         """End."""
 
@@ -60,9 +57,6 @@ class SearchesInLine:
         """Return the answer, once."""
         found, self._found = self._found, None
         return found
-
-    def wait(self) -> None:
-        """Nothing is to be waited for."""
 
     def close(self) -> None:
         """Nothing is open."""
@@ -93,9 +87,6 @@ class SearchesAsLogged:
         searched = self._used_with.get(frame)
         return None if searched is None else Searched(searched, self._found.pop(searched))
 
-    def wait(self) -> None:
-        """Nothing is to be waited for."""
-
     def close(self) -> None:
         """Nothing is open."""
 
@@ -114,6 +105,7 @@ class SearchesBeside:
         assert self._process.stdout is not None
         self._to, self._from = self._process.stdin, self._process.stdout
         self._found: list[Searched] = []
+        self._matcher = matcher
         self._is_busy, self._is_ready = True, threading.Event()
         self._send(_portable(matcher))
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -137,14 +129,11 @@ class SearchesBeside:
             self._is_busy = False
             self._is_ready.set()
 
-    def wait(self) -> None:
-        """Wait until the process has made its matcher."""
-        while not self._is_ready.wait(0.1) and self._process.poll() is None:
-            pass
-
     def offer(self, frame: int, filtered: FilteredFrames, *, urgent: bool) -> None:
-        """Search the frame unless a search runs."""
-        if not self._is_busy:
+        """Search the frame unless a search runs; until the process is there, urgent ones here and now."""
+        if urgent and not self._is_ready.is_set():
+            self._found.append(Searched(frame, self._matcher.match(filtered)[0]))
+        elif not self._is_busy:
             self._is_busy = True
             self._send((frame, filtered))
 

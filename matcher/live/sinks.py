@@ -86,6 +86,7 @@ def as_dict(update: Update) -> dict[str, Any]:
         "reason": update.reason,
         "latency_ms": 1e3 * update.latency_s,
         "tracked": update.located.tracked,
+        "match": None if update.located.match is None else update.located.match.reason,
     }
     if not update.reason and found.pose is not None and found.covariance is not None:
         unit = np.array([1.0, 1.0, math.degrees(1.0)])

@@ -151,7 +151,6 @@ class Tracker:
         match = self.matcher.match(frames)[0]
         near = replace(match, class_name=bank.classes[0], distance_m=middle, delta_rad=0.0, symmetry=1)
         self.matcher.track(frames, [near])
-        self._searches.wait()
 
     def close(self) -> None:
         """End the searches beside."""
