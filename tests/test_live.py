@@ -179,8 +179,11 @@ def test_garbage_half_lines_wrong_sizes_and_jumps_of_the_clock_publish_nothing_w
         b"{" * 3000 + b"\n",
     ]
     rng.shuffle(junk)
-    jumped = json.dumps({**json.loads(printed[40]), "t_ms": 5e9}).encode() + b"\n"
-    lines = [*printed[:10], b"".join(junk), jumped, *printed[41:90]]
+    # more than one: on a busy machine the newest frame may win over the first
+    jumped = [
+        json.dumps({**json.loads(printed[k]), "t_ms": 5e9 + 1e3 * k / RATE_HZ}).encode() + b"\n" for k in range(30, 45)
+    ]
+    lines = [*printed[:10], b"".join(junk), *jumped, *printed[45:90]]
     board = FakeBoard(lines, RATE_HZ)
     said: list[str] = []
     source = open_source(board.on_terminal(), preset(SENSOR))
