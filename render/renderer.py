@@ -496,7 +496,7 @@ class Renderer:
         sums.intensity[:] += light[:, 0].real
 
     def _bouncing(self, columns_hz: Sequence[float]) -> StandingLight:
-        """Return what computes light that bounces; patches are shared with other albedos and cameras."""
+        """Return the source of light that bounces; patches are shared with other albedos and cameras."""
         if self._standing is None or not self._standing.is_of(self.albedo, self.sensor):
             frequencies = [0.0, *columns_hz]
             self._standing = StandingLight(self.topology, self.albedo, self.sensor, frequencies, stands=self._stands)

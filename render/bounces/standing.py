@@ -409,7 +409,7 @@ class StandingLight:
         return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
 
     def _coupled(self, stand: Stand, sheets: Sheets, view: StandingView) -> _Coupled:
-        """Return what sheets exchange with groups and with one another, and the lamp's light on them."""
+        """Return the exchange of light between sheets and groups and among sheets, and the lamp's light on them."""
         lift = stand.patches.lift_m
         to = sheets.centre - stand.outlook[:, None]
         distance = np.linalg.norm(to, axis=2)
@@ -462,7 +462,7 @@ class _Coupled(NamedTuple):
     way: NDArray[np.float64]
 
     def operators(self, wave_number: float, group_area: NDArray[np.float64]) -> tuple[NDArray[np.complex128], ...]:
-        """Return what carries light from sheets to groups, back, and among sheets; and the lamp's light at the sheets.
+        """Return operators from sheets to groups, back, and among sheets; and the lamp's light at the sheets.
 
         Parameters
         ----------
