@@ -9,15 +9,14 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from threading import Lock
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.background import BOUNCES, Background, Backgrounds, check_behind, parameters_of_views
-from phasemark.render.bounces.bounced_light import check_can_bounce
-from phasemark.render.bounces.standing import StandingLight, Stands
+from phasemark.render.bounces.lamp import check_can_bounce
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.area_integral import (
     AreaIntegral,
@@ -37,6 +36,9 @@ from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
+
+if TYPE_CHECKING:
+    from phasemark.render.bounces.standing import StandingLight, Stands
 
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
@@ -497,6 +499,8 @@ class Renderer:
 
     def _bouncing(self, columns_hz: Sequence[float]) -> StandingLight:
         """Return the source of light that bounces; patches are shared with other albedos and cameras."""
+        from phasemark.render.bounces.standing import StandingLight
+
         if self._standing is None or not self._standing.is_of(self.albedo, self.sensor):
             frequencies = [0.0, *columns_hz]
             self._standing = StandingLight(self.topology, self.albedo, self.sensor, frequencies, stands=self._stands)

@@ -188,6 +188,6 @@ def test_the_bound_carries_the_same_terms(bank):
 
 def test_unknown_terms_are_named(bank):
     with pytest.raises(
-        UsageError, match="'systematic' must be among calibration, recording, declared, motion, got 'noise'"
+        UsageError, match="'systematic' must be among calibration, recording, declared, multipath, motion, got 'noise'"
     ):
         Matcher(bank, "refine", systematic=("noise",))

@@ -69,7 +69,7 @@ def calibrate_rig_file(
     for path, one, moved in zip(beside, names.values(), found.wall_m, strict=False):  # none if walls are not free
         files.append(write_file(path, one.with_walls_moved(moved[: len(one.walls)]).to_toml(), force))
     if as_json:
-        echo_json({"files": [str(path) for path in files], **_as_dict(found)})
+        echo_json({"files": [str(path) for path in files], **found.as_dict()})
         return
     _echo(found)
     echo(*files)
@@ -96,21 +96,6 @@ def _poses(tables: Sequence[Path], recordings: Sequence[RigRecording]) -> list[N
         )
     read = [read_stop_poses(path) for path in tables] * (len(recordings) if len(tables) == 1 else 1)
     return [poses_of(recording, table) for recording, table in zip(recordings, read, strict=True)]
-
-
-def _as_dict(found: RigCalibration) -> dict[str, object]:
-    """Return a calibration as plain numbers."""
-    return {
-        "numbers": [dict(zip(("name", "sensor", "change", "std", "unit"), row, strict=True)) for row in found.numbers],
-        "markers": [
-            {"recording": run, "robot": robot, "x_m": x, "y_m": y, "yaw_deg": math.degrees(yaw)}
-            for run, robot, (x, y, yaw) in found.markers
-        ],
-        "stops": found.stops,
-        "rms_before": found.rms[0],
-        "rms_after": found.rms[1],
-        "doubts": list(found.doubts),
-    }
 
 
 def _echo(found: RigCalibration) -> None:

@@ -15,7 +15,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.data.measured import board_prints as prints
 from phasemark.data.measured.boards import BOARDS, Board, find_board, recording_of
 from phasemark.data.measured.csv_frames import parse_csv
@@ -33,7 +33,7 @@ _UNRECOGNISED_LINES = 256
 """Lines after which a source is said to be of no known format."""
 
 
-class SourceFault(PhasemarkError):
+class SourceFault(Exception):
     """Fault of a source that is opened again: it stalled, was unplugged, or is of another format."""
 
 

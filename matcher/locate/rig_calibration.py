@@ -69,6 +69,21 @@ class RigCalibration:
     stops: int
     doubts: tuple[str, ...]
 
+    def as_dict(self) -> dict[str, object]:
+        """Return the calibration as plain numbers."""
+        names = "name", "sensor", "change", "std", "unit"
+        return {
+            "numbers": [dict(zip(names, row, strict=True)) for row in self.numbers],
+            "markers": [
+                {"recording": run, "robot": robot, "x_m": x, "y_m": y, "yaw_deg": math.degrees(yaw)}
+                for run, robot, (x, y, yaw) in self.markers
+            ],
+            "stops": self.stops,
+            "rms_before": self.rms[0],
+            "rms_after": self.rms[1],
+            "doubts": list(self.doubts),
+        }
+
 
 def calibrate_rig(
     rig: Rig,

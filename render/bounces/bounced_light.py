@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.background import Bounces, check_number_of_bounces
-from phasemark.render.bounces.lamp import lamp_rays
+from phasemark.render.bounces.lamp import check_can_bounce, lamp_rays
 from phasemark.render.bounces.patches import make_patches
 from phasemark.render.bounces.radiosity import arriving
 from phasemark.render.bounces.refinement import even_sizes, sizes_for_light
@@ -286,18 +286,6 @@ def check_bounces(bounces: Bounces, tolerance: float, sensor: Sensor) -> None:
         raise UsageError(f"'bounce_tolerance' must be positive, got {tolerance!r}")
     if bounces:
         check_can_bounce(sensor)
-
-
-def check_can_bounce(sensor: Sensor) -> None:
-    """Refuse a sensor for which light that bounces is not computed.
-
-    Raises
-    ------
-    UsageError
-    """
-    if sensor.histogram is not None:
-        raise UsageError("histograms of light that bounces are not computed: 'bounces' must be 0 for this sensor")
-    lamp_rays(sensor, 1)
 
 
 def pixels_of(samples: SceneSamples, sensor: Sensor) -> NDArray[np.int64]:

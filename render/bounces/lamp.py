@@ -42,3 +42,15 @@ def lamp_rays(sensor: Sensor, n: int = _RAYS) -> tuple[NDArray[np.float64], NDAr
     sine, turn = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)), 2 * math.pi * _GOLDEN * k
     directions = np.column_stack([cosine, sine * np.cos(turn), sine * np.sin(turn)])
     return directions, 2 * math.pi * height / n * sensor.lamp_intensity(cosine)
+
+
+def check_can_bounce(sensor: Sensor) -> None:
+    """Refuse a sensor for which light that bounces is not computed.
+
+    Raises
+    ------
+    UsageError
+    """
+    if sensor.histogram is not None:
+        raise UsageError("histograms of light that bounces are not computed: 'bounces' must be 0 for this sensor")
+    lamp_rays(sensor, 1)
