@@ -110,7 +110,7 @@ def open_sink(name: str, sensor: Sensor, *, force: bool = False) -> Sink:
     Parameters
     ----------
     name : str
-        ``-`` or ``jsonl:FILE``: lines of JSON. ``ros`` or ``ros:NAME``: topics of ROS 2 over DDS below NAME.
+        ``jsonl:FILE``, or ``-`` for standard output: lines of JSON. ``ros``, ``ros:NAME``: topics of ROS 2 below NAME.
         ``mavlink:udpout:HOST:PORT`` or another address of pymavlink. ``mcap:FILE``: a log of everything.
         ``foxglove`` or ``foxglove://HOST:PORT``: a server that Foxglove shows.
     sensor : Sensor
