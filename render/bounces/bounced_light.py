@@ -14,7 +14,6 @@ from phasemark.render.bounces.lamp import check_can_bounce, lamp_rays
 from phasemark.render.bounces.patches import make_patches
 from phasemark.render.bounces.radiosity import arriving
 from phasemark.render.bounces.refinement import even_sizes, sizes_for_light
-from phasemark.render.bounces.slopes import slopes_of
 from phasemark.render.bounces.transport import transport_between
 from phasemark.render.integral.area_integral import camera_of, of_poses
 from phasemark.render.integral.arguments import Poses
@@ -100,7 +99,6 @@ class BouncedLight:
         sizes = sizes_for_light(even_sizes(size, poses.lens), self.patches, self._brightness())
         self.patches = make_patches(topology, sizes, intersector=kind)
         self.transport = transport_between(self.patches)
-        self._slopes = slopes_of(self.patches)
 
     def _brightness(self) -> NDArray[np.float64]:
         """Return the most light that arrives at each patch in any pose, directly and in two bounces."""
@@ -219,7 +217,7 @@ class BouncedLight:
         """Return the share of the light at patches that pixels receive, (poses, pixels, powers)."""
         n, views, powers = light.shape
         pixels = self.sensor.rows * self.sensor.cols
-        slopes = [np.asarray(axis @ light.reshape(n, -1)).reshape(light.shape) for axis in self._slopes]
+        slopes = [np.asarray(axis @ light.reshape(n, -1)).reshape(light.shape) for axis in self.transport.slopes]
         out = np.zeros((views, pixels, powers + (free is not None)), np.complex128)
         for view, points in enumerate(seen):
             patch = points.patch
@@ -251,8 +249,8 @@ def refined(
     topology, intersector, sensor, poses, kind
         As :class:`BouncedLight` has them.
     tolerance : float
-        Root mean square over the pixels of the first pose of the change at the highest frequency when the patches
-        shrink by √2, as a share of the brightest pixel's direct light.
+        Largest change of a pixel of the first pose, at the highest frequency, when the patches shrink by √2, as a share
+        of the brightest pixel's direct light.
 
     Raises
     ------
@@ -264,7 +262,7 @@ def refined(
         found = BouncedLight(topology, intersector, sensor, of_poses(poses, slice(0, 1)), size, kind)
         light = found.phasors([max(sensor.frequencies_hz)], _ENOUGH, tolerance)[0, :, 0, 0]
         if before is not None:
-            change = float(np.sqrt(np.mean(np.abs(light - before) ** 2))) / found.brightest
+            change = float(np.abs(light - before).max()) / found.brightest
         if change <= tolerance:
             return found if len(poses.lens) == 1 else BouncedLight(topology, intersector, sensor, poses, size, kind)
         before, size = light, _FINER * size

@@ -25,6 +25,8 @@ _DEEP = 0.2
 """Largest extent of a patch across its first facet, in sizes of the patch: surfaces in two planes are not joined."""
 _LIFT = 1e-5
 """Share of the scene's extent by which rays begin above their surface, as they are of single precision."""
+_NEAREST = 0.1
+"""Least distance from a lens that points resolve, in sizes of a patch."""
 SizeAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """From points and normals of surfaces, (n, 3) each, to a length, (n,) m."""
 
@@ -131,6 +133,45 @@ class Patches:
         along = np.einsum("ij,ij->i", normal, corner - begin) / np.where(facing == 0, 1.0, facing)
         return np.asarray((facet < 0) | (along >= 1.0))
 
+    def points_before(
+        self, lens: NDArray[np.float64], share: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Return points at which light from a place is received: four of a patch, more of one near the place.
+
+        Parameters
+        ----------
+        lens : (3,) float64
+        share : float
+            Size of a patch, as a share of its distance from the lens, from which on it has more points, and of what
+            they stand for.
+
+        Returns
+        -------
+        points, normals : (m, 3) float64
+            Points a little above the surface.
+        weights : (m,) float64
+            Shares of the patch's area.
+        patch : (m,) int64
+        """
+        near = self.size > share * np.linalg.norm(self.centre - lens, axis=1)
+        own = np.repeat(np.arange(len(self)), np.diff(self.first))
+        cut = near[own]
+        own, facet = own[cut], self.members[cut]
+        pieces, part, _ = _cut(
+            self.facets.corners[facet],
+            np.arange(len(own)),
+            lambda at, k: share * np.maximum(np.linalg.norm(at - lens, axis=1), _NEAREST * self.size[own[k]]),
+        )
+        edges = pieces[:, 1:] - pieces[:, :1]
+        area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+        normals = self.side[own, None] * self.facets.normals[facet]
+        few = np.flatnonzero(~near)
+        patch = np.concatenate([np.repeat(few, POINTS), own[part]])
+        up = np.concatenate([self.normals[few].reshape(-1, 3), normals[part]])
+        points = np.concatenate([self.points[few].reshape(-1, 3), pieces.mean(axis=1)])
+        weights = np.concatenate([self.weights[few].ravel(), area / self.area[own[part]]])
+        return points + self.lift_m * up, up, weights, patch
+
 
 def make_patches(
     topology: MeshTopology,
@@ -154,7 +195,10 @@ def make_patches(
         As for :class:`~phasemark.render.Renderer`.
     """
     lift = _LIFT * float((topology.high - topology.low).max())
-    triangles, face, sizes = _cut(topology, size_at)
+    normals = topology.planes[:, :3]
+    triangles, face, sizes = _cut(
+        topology.vertices[topology.faces], np.arange(len(topology.faces)), lambda at, own: size_at(at, normals[own])
+    )
     triangles, own = cut_where_bodies_stand(triangles, face, topology, lift)
     face, sizes = face[own], sizes[own]
     solid = _Solid(topology, intersector, lift)
@@ -181,20 +225,26 @@ def _halved(triangles: NDArray[np.float64], face: NDArray[np.int64]) -> tuple[ND
     return halves, np.concatenate([face, face])
 
 
-def _cut(topology: MeshTopology, size_at: SizeAt) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-    """Cut the faces in two until none is longer than patches may be there; return triangles, faces and these sizes."""
-    triangles, face = topology.vertices[topology.faces], np.arange(len(topology.faces))
+def _cut(
+    triangles: NDArray[np.float64],
+    own: NDArray[np.int64],
+    size_at: Callable[[NDArray[np.float64], NDArray[np.int64]], NDArray[np.float64]],
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    """Cut triangles in two until none is longer than `size_at` says of its centroid and of what it is a part of.
+
+    Return triangles, what they are a part of, and these sizes.
+    """
     done = []
     while len(triangles):
-        sizes = size_at(triangles.mean(axis=1), topology.planes[face, :3])
+        sizes = size_at(triangles.mean(axis=1), own)
         longest = _longest(triangles)
         edges = triangles[:, 1:] - triangles[:, :1]
         thin = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) < _THIN * longest**2
         long = longest > np.where(thin, _SHORTER, 1.0) * sizes
-        done.append((triangles[~long], face[~long], sizes[~long]))
-        triangles, face = _halved(triangles[long], face[long])
-    whole, faces, sizes = (np.concatenate(column) for column in zip(*done, strict=True))
-    return whole, faces, sizes
+        done.append((triangles[~long], own[~long], sizes[~long]))
+        triangles, own = _halved(triangles[long], own[long])
+    whole, parts, sizes = (np.concatenate(column) for column in zip(*done, strict=True))
+    return whole, parts, sizes
 
 
 class _Solid:

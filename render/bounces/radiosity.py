@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from phasemark import UsageError
 from phasemark.render.background import Bounces
+from phasemark.render.bounces.transport import Operator
 
 _MOST = 1000
 """Bounces after which light that still goes on is given up."""
@@ -17,7 +17,7 @@ _SMALL = 1e-2
 
 def arriving(
     lamp: NDArray[np.complex128],
-    operator: sparse.csr_array,
+    operator: Operator,
     albedo: NDArray[np.float64],
     bounces: Bounces,
     tolerance: float,
@@ -32,7 +32,7 @@ def arriving(
     ----------
     lamp : (n, v) complex128
         What arrives from the lamp directly, mean over each patch, in v views: cos θ / r² · e^{iκr}.
-    operator : (n, n) sparse array
+    operator : Operator
         From :meth:`~phasemark.render.bounces.transport.Transport.operator`.
     albedo : (n,) float64
     bounces : int or "all"
@@ -65,7 +65,7 @@ def arriving(
             while leaving.shape[2] > 1 and np.abs(leaving[:, :, -1]).max() <= _SMALL * tolerance * np.abs(lamp).max():
                 leaving = leaving[:, :, :-1]
             found = np.pad(found, ((0, 0), (0, 0), (0, leaving.shape[2] - found.shape[2])))
-        term = np.asarray(operator @ leaving.reshape(len(albedo), -1)).reshape(leaving.shape)
+        term = (operator @ leaving.reshape(len(albedo), -1)).reshape(leaving.shape)
         found = found + term
         before, size = size, float(np.abs(term).max(initial=0.0))
         first = first or size

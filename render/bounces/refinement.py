@@ -10,8 +10,10 @@ from phasemark.render.bounces.patches import Patches, SizeAt
 
 _BRIGHT, _DIMMEST = 0.3, 0.004
 """Shares of the brightest patch's light from which on, and down to which, patches grow in darkness."""
-_FINEST = 0.2
+_FINEST = 0.14
 """Smallest size where surfaces meet, as a share of the size where they do not."""
+_GAP = 0.5
+"""Size where surfaces are close, as a share of the gap between them."""
 _CONTINUES = 0.5
 """Least cosine between normals of a surface and of another that may be its continuation around a bend."""
 
@@ -40,7 +42,7 @@ def sizes_for_light(wanted_at: SizeAt, coarse: Patches, light: NDArray[np.float6
         sides = [tree.query(np.concatenate([points, side * reach * normals], axis=1)) for side in (1, -1)]
         (away, near), (away_behind, near_behind) = sides
         dark = np.where(away < away_behind, darkness[near], darkness[near_behind])
-        return np.asarray(dark * np.clip(_gaps(points, normals, coarse), _FINEST * wanted, wanted))
+        return np.asarray(dark * np.clip(_GAP * _gaps(points, normals, coarse), _FINEST * wanted, wanted))
 
     return size_at
 

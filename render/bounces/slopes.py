@@ -12,6 +12,8 @@ from phasemark.render.bounces.patches import Patches
 
 _NEAREST = 16
 """Patches among which neighbours are looked for."""
+_FLAT, _SAME_PLANE_M = 1e-9, 1e6
+"""Normals of a plane patch add up to one but for this; distance that neighbours of unlike planes seem to have."""
 _ALIKE = 0.8
 """Least cosine between the normals of neighbours."""
 _BESIDE = 0.3
@@ -29,13 +31,20 @@ class Slopes(NamedTuple):
 def slopes_of(patches: Patches) -> Slopes:
     """Return slopes fitted through neighbours that continue the surface, those nearer with more weight."""
     n, count = len(patches), min(_NEAREST, len(patches))
-    _, near = cKDTree(patches.centre).query(patches.centre, k=count)
-    near = np.asarray(near).reshape(n, count)
-    unit = patches.normal / np.linalg.norm(patches.normal, axis=1, keepdims=True)
+    length = np.linalg.norm(patches.normal, axis=1, keepdims=True)
+    unit = patches.normal / length
+    planes = np.column_stack([unit, np.einsum("ij,ij->i", unit, patches.centre)])
+    near = np.empty((n, count), np.int64)
+    flat_ones = length[:, 0] > 1 - _FLAT
+    for own, apart_m in ((flat_ones, _SAME_PLANE_M), (~flat_ones, 0.0)):
+        places = np.column_stack([patches.centre, apart_m * planes])
+        near[own] = cKDTree(places).query(places[own], k=count)[1].reshape(-1, count)
     offset = patches.centre[near] - patches.centre[:, None]
     height = np.einsum("nkj,nj->nk", offset, unit)
     distance = np.linalg.norm(offset, axis=2)
-    beside = (patches.body[near] == patches.body[:, None]) & (np.einsum("nkj,nj->nk", unit[near], unit) > _ALIKE)
+    least = np.where(flat_ones, 1 - _FLAT, _ALIKE)[:, None]
+    beside = (patches.body[near] == patches.body[:, None]) & (patches.albedo[near] == patches.albedo[:, None])
+    beside &= (np.einsum("nkj,nj->nk", unit[near], unit) > least)
     beside &= (np.abs(height) < _BESIDE * distance) & (distance > 0)
     flat = offset - height[:, :, None] * unit[:, None]
     weight = np.where(beside, 1 / (distance**2 + (0.5 * patches.size[:, None]) ** 2), 0.0)

@@ -23,8 +23,7 @@ from phasemark.render.background import BOUNCES
 from phasemark.render.bounces.bounced_light import pixels_of, summed
 from phasemark.render.bounces.patches import Patches, SizeAt, make_patches
 from phasemark.render.bounces.sheets import Sheets
-from phasemark.render.bounces.slopes import Slopes, slopes_of
-from phasemark.render.bounces.transport import Transport, transport_between
+from phasemark.render.bounces.transport import transport_between
 from phasemark.render.integral.area_integral import camera_of, of_poses, topology_of
 from phasemark.render.integral.arguments import Poses
 from phasemark.render.integral.intersect import make_intersector
@@ -56,6 +55,8 @@ _ALBEDOS = 0.5 - 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3)
 """Albedos of the floor at which nodes are computed: light is a polynomial in it, of which the square suffices."""
 _MOST_NODES = 2000
 """Nodes that are kept, of 0.2 to 0.5 MB each."""
+_NEAR_LENS = 0.2
+"""Size of patches, as a share of their distance from the lens, over which the lamp's light is not even."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
 _SMALL = 5e-3
@@ -96,13 +97,13 @@ class Stand:
         topology = _with_floor(mesh, floor_z_m)
         size_at = _sizes(mesh, floor_z_m)
         self.patches = make_patches(topology, size_at, intersector=kind)
-        self.slopes: Slopes = slopes_of(self.patches)
-        transport: Transport = transport_between(self.patches)
+        transport = transport_between(self.patches)
+        self.slopes = transport.slopes
         self._gather_groups(size_at)
         n, g = len(self.patches), len(self.area)
         share = self.patches.area / self.area[self.group]
         self.mean = sparse.csr_array((share, (self.group, np.arange(n))), shape=(g, n))
-        self.operators = [transport.operator(number).astype(np.complex64) for number in wave_numbers]
+        self.operators = [transport.operator(number, np.complex64) for number in wave_numbers]
 
     def _gather_groups(self, size_at: SizeAt) -> None:
         """Join patches of one body that face alike into groups, as `size_at` says how large patches are."""
@@ -367,7 +368,7 @@ class StandingLight:
         (frequencies, n, albedos of the floor) and (frequencies, w, albedos).
         """
         patches, sheets = stand.patches, self._sheets(view)
-        n, k = patches.weights.shape
+        n = len(patches)
         whole = np.ones(n)
         if sheets is not None:  # the floor of patches ends at the strip
             ahead = np.array([math.cos(view.delta_rad), math.sin(view.delta_rad), 0.0])
@@ -375,13 +376,13 @@ class StandingLight:
             whole = np.where(patches.body == _FLOOR, np.clip(0.5 - beyond / patches.size, 0.0, 1.0), 1.0)
         own = patches.body == _LANDMARK
         returned = whole[:, None] * np.where(own[:, None], (self._albedo * patches.albedo)[:, None], _ALBEDOS)
-        lifted = patches.points + patches.lift_m * patches.normals
-        light, way = self._lamp(lifted.reshape(-1, 3), patches.normals.reshape(-1, 3), view, patches)
-        light *= patches.weights.ravel()
+        points, normals, weights, owner = patches.points_before(view.lens, _NEAR_LENS)
+        light, way = self._lamp(points, normals, view, patches)
+        light *= weights
         coupled = None if sheets is None else self._coupled(stand, sheets, view)
         found, at_sheets = [], []
         for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
-            lamp = (light * np.exp(1j * wave_number * way)).reshape(n, k).sum(axis=1)
+            lamp = summed(owner, light * np.exp(1j * wave_number * way), n)
             term, of_sheets = (
                 np.repeat(lamp[:, None], len(_ALBEDOS), axis=1),
                 np.zeros((0, len(_ALBEDOS)), np.complex128),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,15 @@ from scipy import sparse
 from phasemark import UsageError
 from phasemark.render.bounces.form_factors import triangle_form_factor
 from phasemark.render.bounces.patches import POINTS, Patches
+from phasemark.render.bounces.slopes import Slopes, slopes_of
 from phasemark.render.kernel import kernel
 
 _CLOSE = 3.0
 """Patches nearer to one another than this many of their sizes take the closed form of their facets."""
 _NEAR = 20.0
 """Those nearer than this take four points each; those beyond, one."""
+_SLOPING = 2.0
+"""Over patches nearer than this the light that they send is taken as sloping, and as even over those beyond."""
 _BYTES, _MOST_GIB = 60, 16
 """Of a pair of patches that see each other, and of all."""
 _PAIRS = 1 << 21
@@ -36,30 +39,69 @@ class Transport(NamedTuple):
         the mean over the receiver of ∫ cos θ cos θ' / (π d²) V dA over the sender.
     way : (m, 2) float64
         Mean, m, and variance, m², of the distances between points of both.
-    n : int
-        Number of patches.
+    near : (k,) int64
+        Pairs that are near one another.
+    moment : (k, 2, 3) float64
+        Of these, for light that slopes over the sender: the integral of `form_factor` times the place from the
+        sender's centre, m.
+    slopes : Slopes
+        Of the light along the patches.
     """
 
     one: NDArray[np.int64]
     other: NDArray[np.int64]
     form_factor: NDArray[np.float64]
     way: NDArray[np.float64]
-    n: int
+    near: NDArray[np.int64]
+    moment: NDArray[np.float64]
+    slopes: Slopes
 
-    def operator(self, wave_number: float) -> sparse.csr_array:
-        """Return the (n, n) matrix from the light that leaves patches to that which arrives at them.
+    def operator(self, wave_number: float, dtype: type[np.complexfloating[Any, Any]] = np.complex128) -> Operator:
+        """Return the map from the light that leaves patches to that which arrives at them.
 
         Parameters
         ----------
         wave_number : float
-            κ = 2πf / c, rad/m; 0: of intensities, real.
+            κ = 2πf / c, rad/m; 0: of intensities.
+        dtype : type
+            Of its numbers.
         """
-        rows, columns = np.concatenate([self.one, self.other]), np.concatenate([self.other, self.one])
-        values = self.form_factor
-        if wave_number:
-            mean, variance = self.way.T
-            values = values * np.exp(1j * wave_number * mean - 0.5 * wave_number**2 * variance)[:, None]
-        return sparse.csr_array((values.T.ravel(), (rows, columns)), shape=(self.n, self.n))
+        n, near = self.slopes.x.shape[0], self.near
+        mean, variance = self.way.T
+        turned = np.exp(1j * wave_number * mean - 0.5 * wave_number**2 * variance)
+        even = (self.form_factor * turned[:, None]).astype(dtype)
+        sloping = (self.moment * turned[near, None, None]).astype(dtype)
+        receivers = np.concatenate([self.one[near], self.other[near]])
+        senders = np.concatenate([self.other[near], self.one[near]])
+        axes = np.arange(3)[:, None]
+        places = np.tile(receivers, 3), (senders + n * axes).ravel()
+        return Operator(
+            sparse.csr_array(
+                (even.T.ravel(), (np.r_[self.one, self.other], np.r_[self.other, self.one])), shape=(n, n)
+            ),
+            sparse.csr_array((sloping.transpose(2, 1, 0).ravel(), places), shape=(n, 3 * n)),
+            sparse.vstack(self.slopes).tocsr().astype(np.float32 if dtype is np.complex64 else np.float64),
+        )
+
+
+class Operator(NamedTuple):
+    """Light that arrives at n patches, of light that leaves them: what `@` applies.
+
+    Parameters
+    ----------
+    even : (n, n) sparse array
+        Of the means over the senders.
+    sloping : (n, 3n) sparse array
+        Of the slopes over those that are near, axis by axis.
+    slopes : (3n, n) sparse array
+    """
+
+    even: sparse.csr_array
+    sloping: sparse.csr_array
+    slopes: sparse.csr_array
+
+    def __matmul__(self, leaving: NDArray[Any]) -> NDArray[Any]:
+        return np.asarray(self.even @ leaving + self.sloping @ (self.slopes @ leaving))
 
 
 def transport_between(patches: Patches) -> Transport:
@@ -80,23 +122,28 @@ def transport_between(patches: Patches) -> Transport:
     rows = max(_PAIRS // n, 1)
     one, other = np.empty((2, rows * n), np.int64)
     factor, way = np.empty((2, rows * n, 2))
+    moment = np.empty((rows * n, 2, 3))
     far = np.empty(rows * n, np.bool_)
     geometry = (
         patches.points, patches.normals, patches.weights, patches.centre, patches.normal, patches.area, patches.size,
     )  # fmt: skip
     polygons = patches.first, patches.members, patches.side, patches.facets.corners
     for start in range(0, n, rows):
-        m = _form_factors(start, min(start + rows, n), geometry, polygons, one, other, factor, way, far)
+        m = _form_factors(start, min(start + rows, n), geometry, polygons, one, other, factor, way, moment, far)
         visible = np.empty(m)
         visible[far[:m]] = _seen_by_centres(patches, one[:m][far[:m]], other[:m][far[:m]])
         visible[~far[:m]] = _seen_by_points(patches, one[:m][~far[:m]], other[:m][~far[:m]])
         visible[one[:m] == other[:m]] = 1.0
         kept = visible > 0
-        found.append((one[:m][kept], other[:m][kept], (factor[:m] * visible[:, None])[kept], way[:m][kept]))
-    i, j, factors, ways = (np.concatenate(column) for column in zip(*found, strict=True))
+        sloping = moment[:m].any(axis=(1, 2))[kept]
+        moments = (moment[:m] * visible[:, None, None])[kept][sloping]
+        pairs = one[:m][kept], other[:m][kept], (factor[:m] * visible[:, None])[kept], way[:m][kept]
+        found.append((*pairs, sloping, moments))
+    i, j, factors, ways, near, moments = (np.concatenate(column) for column in zip(*found, strict=True))
+    near = np.flatnonzero(near)
     received = np.bincount(i, factors[:, 0], n) + np.bincount(j, factors[:, 1], n)
-    factors /= np.maximum(np.column_stack([received[i], received[j]]), 1.0)  # no patch receives more than all
-    return Transport(i, j, factors, ways, n)
+    most = np.maximum(np.column_stack([received[i], received[j]]), 1.0)  # no patch receives more than all
+    return Transport(i, j, factors / most, ways, near, moments / most[near, :, None], slopes_of(patches))
 
 
 def _seen_by_centres(patches: Patches, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -136,7 +183,7 @@ def _kernel(p, n, q, m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far):  # type: ignore[no-untyped-def]
+def _form_factors(start, stop, geometry, polygons, one, other, factor, way, moment, far):  # type: ignore[no-untyped-def]
     """Write pairs of patches, the first from `start` to `stop`, as if nothing stood between; return how many."""
     points, normals, weights, centre, normal, area, size = geometry
     count = 0
@@ -150,6 +197,7 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far)
                 continue
             distance = math.sqrt(x * x + y * y + z * z)
             total, first, second = 0.0, 0.0, 0.0
+            moment[count] = 0.0
             if distance > _NEAR * reach:
                 total = _kernel(centre[i], normal[i], centre[j], normal[j])
                 first, second = total * distance, total * distance * distance
@@ -162,6 +210,9 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far)
                         for axis in range(3):
                             square += (points[i, k, axis] - points[j, m, axis]) ** 2
                         total, first, second = total + pair, first + pair * math.sqrt(square), second + pair * square
+                        for axis in range(3):
+                            moment[count, 0, axis] += pair * (points[j, m, axis] - centre[j, axis])
+                            moment[count, 1, axis] += pair * (points[i, k, axis] - centre[i, axis])
             if total == 0.0:
                 continue
             one[count], other[count], far[count] = i, j, distance > _NEAR * reach
@@ -172,6 +223,10 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far)
             else:
                 factor[count, 0] = _closely(i, j, geometry, polygons)
                 factor[count, 1] = 0.0 if i == j else _closely(j, i, geometry, polygons)
+            for side in range(2):
+                scale = factor[count, side] / total if distance < _SLOPING * reach and i != j else 0.0
+                for axis in range(3):
+                    moment[count, side, axis] *= scale
             count += 1
     return count
 
