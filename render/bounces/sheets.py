@@ -17,6 +17,8 @@ _AROUND = 1.3
 _MARGIN_M, _WIDEST_RAD = 0.3, math.radians(60.0)
 _DEEPEST_M, _SHARE, _LEAST_M = 1.0, 0.6, 0.02
 """Depth of the strip: at most, as a share of the gap between landmark and wall, and at least."""
+_NARROWER = 2.0
+"""By how much columns in the middle, where the landmark's shadow ends, are narrower than evenly spaced ones."""
 _RAYS = 4
 """Points a side of a patch at which the lamp's light is taken."""
 
@@ -83,7 +85,8 @@ class Sheets(NamedTuple):
         ahead = np.array([math.cos(delta_rad), math.sin(delta_rad), 0.0])
         left, up = np.array([-ahead[1], ahead[0], 0.0]), np.array([0.0, 0.0, 1.0])
         foot = lens + wall_m * ahead
-        columns = np.linspace(-reach, reach, _COLS + 1)
+        share = np.linspace(-1.0, 1.0, _COLS + 1)
+        columns = reach * share * (1 + _NARROWER * share**2) / (1 + _NARROWER)
         rise = np.linspace(0.0, 1.0, _ROWS + 1)
         low = -floor_m if floor_m else -reach
         sheets = [(low + (reach - low) * (rise**2 if floor_m else rise), foot, up, -ahead)]
@@ -98,7 +101,7 @@ class Sheets(NamedTuple):
             tall = np.tile(np.diff(rows), _COLS)[:, None] * along
             parts.append((middle, centre, np.tile(normal, (len(y), 1)), tall))
         centre, normal, tall = (np.concatenate(column) for column in list(zip(*parts, strict=True))[1:])
-        width = columns[1] - columns[0]
+        width = np.tile(np.repeat(np.diff(columns), _ROWS), len(sheets))
         return cls(
             0.5 * (columns[1:] + columns[:-1]),
             parts[0][0],
@@ -106,7 +109,7 @@ class Sheets(NamedTuple):
             depth,
             centre,
             normal,
-            np.tile(width * left, (len(centre), 1)),
+            width[:, None] * left,
             tall,
             width * np.linalg.norm(tall, axis=1),
         )

@@ -35,13 +35,13 @@ from phasemark.render.threads import mapped
 from phasemark.render.view import Views
 
 _LANDMARK, _FLOOR = 0, 1
-_PATCH = 0.4
+_PATCH = 0.3
 """Size of patches as a share of the landmark's own, before surfaces come close."""
 _NEAR_LINES, _FINEST_SHARE = 0.5, 0.05
 """Size of patches beside lines where surfaces meet, as a share of the distance from them; the least, of the extent."""
 _HOLLOW_RAD = 0.1
 """Least angle between faces of a hollow edge."""
-_GROWTH = 0.25
+_GROWTH = 0.15
 """By how much patches of the floor grow with the distance from the landmark."""
 _WIDEST_M, _REACH_M = 1.0, 5.0
 """Largest patch of the floor, and how far the floor reaches."""
