@@ -234,8 +234,8 @@ def _cut(
 
     Return triangles, what they are a part of, and these sizes.
     """
-    done = []
-    while len(triangles):
+    done: list[tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]] = []
+    while len(triangles) or not done:
         sizes = size_at(triangles.mean(axis=1), own)
         longest = _longest(triangles)
         edges = triangles[:, 1:] - triangles[:, :1]

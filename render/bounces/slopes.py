@@ -44,7 +44,7 @@ def slopes_of(patches: Patches) -> Slopes:
     distance = np.linalg.norm(offset, axis=2)
     least = np.where(flat_ones, 1 - _FLAT, _ALIKE)[:, None]
     beside = (patches.body[near] == patches.body[:, None]) & (patches.albedo[near] == patches.albedo[:, None])
-    beside &= (np.einsum("nkj,nj->nk", unit[near], unit) > least)
+    beside &= np.einsum("nkj,nj->nk", unit[near], unit) > least
     beside &= (np.abs(height) < _BESIDE * distance) & (distance > 0)
     flat = offset - height[:, :, None] * unit[:, None]
     weight = np.where(beside, 1 / (distance**2 + (0.5 * patches.size[:, None]) ** 2), 0.0)

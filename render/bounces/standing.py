@@ -55,7 +55,7 @@ _ALBEDOS = 0.5 - 0.5 * np.cos(np.pi * (np.arange(3) + 0.5) / 3)
 """Albedos of the floor at which nodes are computed: light is a polynomial in it, of which the square suffices."""
 _MOST_NODES = 2000
 """Nodes that are kept, of 0.2 to 0.5 MB each."""
-_NEAR_LENS = 0.2
+_NEAR_LENS = 0.1
 """Size of patches, as a share of their distance from the lens, over which the lamp's light is not even."""
 _LAMP_STEP_RAD = math.radians(1.0)
 """Directions of the lamp's axis that count as the same."""
@@ -103,7 +103,7 @@ class Stand:
         n, g = len(self.patches), len(self.area)
         share = self.patches.area / self.area[self.group]
         self.mean = sparse.csr_array((share, (self.group, np.arange(n))), shape=(g, n))
-        self.operators = [transport.operator(number, np.complex64) for number in wave_numbers]
+        self.operators = [transport.operator(number, single=True) for number in wave_numbers]
 
     def _gather_groups(self, size_at: SizeAt) -> None:
         """Join patches of one body that face alike into groups, as `size_at` says how large patches are."""
@@ -383,10 +383,8 @@ class StandingLight:
         found, at_sheets = [], []
         for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
             lamp = summed(owner, light * np.exp(1j * wave_number * way), n)
-            term, of_sheets = (
-                np.repeat(lamp[:, None], len(_ALBEDOS), axis=1),
-                np.zeros((0, len(_ALBEDOS)), np.complex128),
-            )
+            term: NDArray[Any] = np.repeat(lamp[:, None], len(_ALBEDOS), axis=1)
+            of_sheets = np.zeros((0, len(_ALBEDOS)), np.complex128)
             if coupled is not None:
                 to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
             total, total_sheets = np.zeros_like(term), np.zeros_like(of_sheets)

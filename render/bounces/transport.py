@@ -56,36 +56,39 @@ class Transport(NamedTuple):
     moment: NDArray[np.float64]
     slopes: Slopes
 
-    def operator(self, wave_number: float, dtype: type[np.complexfloating[Any, Any]] = np.complex128) -> Operator:
+    def operator(self, wave_number: float, *, single: bool = False) -> Operator:
         """Return the map from the light that leaves patches to that which arrives at them.
 
         Parameters
         ----------
         wave_number : float
-            κ = 2πf / c, rad/m; 0: of intensities.
-        dtype : type
-            Of its numbers.
+            κ = 2πf / c, rad/m; 0: of intensities, real.
+        single : bool
+            Whether its numbers are of single precision.
         """
         n, near = self.slopes.x.shape[0], self.near
         mean, variance = self.way.T
-        turned = np.exp(1j * wave_number * mean - 0.5 * wave_number**2 * variance)
+        real = np.float32 if single else np.float64
+        dtype = np.result_type(real, np.complex64) if wave_number else real
+        turned = np.ones(len(mean))
+        if wave_number:
+            turned = np.exp(1j * wave_number * mean - 0.5 * wave_number**2 * variance)
         even = (self.form_factor * turned[:, None]).astype(dtype)
         sloping = (self.moment * turned[near, None, None]).astype(dtype)
         receivers = np.concatenate([self.one[near], self.other[near]])
         senders = np.concatenate([self.other[near], self.one[near]])
         axes = np.arange(3)[:, None]
         places = np.tile(receivers, 3), (senders + n * axes).ravel()
+        pairs = np.r_[self.one, self.other], np.r_[self.other, self.one]
         return Operator(
-            sparse.csr_array(
-                (even.T.ravel(), (np.r_[self.one, self.other], np.r_[self.other, self.one])), shape=(n, n)
-            ),
+            sparse.csr_array((even.T.ravel(), pairs), shape=(n, n)),
             sparse.csr_array((sloping.transpose(2, 1, 0).ravel(), places), shape=(n, 3 * n)),
-            sparse.vstack(self.slopes).tocsr().astype(np.float32 if dtype is np.complex64 else np.float64),
+            sparse.vstack(self.slopes).tocsr().astype(real),
         )
 
 
 class Operator(NamedTuple):
-    """Light that arrives at n patches, of light that leaves them: what `@` applies.
+    """Map from light that leaves n patches to light that arrives at them, which `@` applies.
 
     Parameters
     ----------
@@ -135,7 +138,7 @@ def transport_between(patches: Patches) -> Transport:
         visible[~far[:m]] = _seen_by_points(patches, one[:m][~far[:m]], other[:m][~far[:m]])
         visible[one[:m] == other[:m]] = 1.0
         kept = visible > 0
-        sloping = moment[:m].any(axis=(1, 2))[kept]
+        sloping = np.asarray(moment[:m].any(axis=(1, 2)))[kept]
         moments = (moment[:m] * visible[:, None, None])[kept][sloping]
         pairs = one[:m][kept], other[:m][kept], (factor[:m] * visible[:, None])[kept], way[:m][kept]
         found.append((*pairs, sloping, moments))
