@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import pytest
 import zmq
 from programs.fake_board import FakeBoard
 from rich.console import Console
+from rig_trials import ring_rig, room
 from rosbags.typesys import Stores, get_typestore
 
 from phasemark import InputFileError, OutputExistsError, UsageError
@@ -30,9 +32,12 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.live import Live, Tracker, open_sink, open_source
+from phasemark.matcher.live.map_tracker import MapTracker
+from phasemark.matcher.live.rig_frames import open_rig_source
 from phasemark.matcher.live.search_beside import SearchesAsLogged, SearchesInLine
 from phasemark.matcher.live.sources import SourceFault
 from phasemark.matcher.live.tracker import Located
+from phasemark.matcher.locate import Locator, read_rig_recording, recording_bytes, simulated_recording
 from phasemark.matcher.sequence import Estimate, FreeMotion, PoseEstimator, Standing
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
@@ -249,7 +254,7 @@ class _SlowLocator:
 
     def locate(self, frames, stamp_s):
         time.sleep(self._takes_s)
-        return Located(Estimate(False, "searching"), None, kalman_filter(frames))
+        return Located(Estimate(False, "searching"), None, None)
 
     def warm(self):
         pass
@@ -381,7 +386,7 @@ def test_results_of_a_tmf8829_come_over_zeromq():
     frame = struct.pack("<BBHI3bBHH", 0x12, 1, len(zones) + 12 + 12, 1, 25, 25, 25, 0, 0, 0) + zones
     frame += struct.pack("<IIBBH", 0, 0, 1, 0, 0xE0F7)
     message = struct.pack("<IB3xI", 0xFE5E1234, 2, len(frame) + 77).ljust(84, b"\0") + b"\0" * 5 + frame
-    source, found = open_source(f"zmq://127.0.0.1:{port}", sensor), []
+    source, found = open_source(f"zmq://127.0.0.1:{port}", sensor), list[Any]()
 
     def read():
         for arrival in source.frames():
@@ -408,9 +413,9 @@ def test_a_page_on_localhost_and_the_terminal_show_zones_residual_and_pose(bank,
     from phasemark.matcher.live.terminal import drawn
 
     tracker = tracker_of(bank)
-    page = PageView(0, tracker)
+    page = PageView(0, tracker.matcher.bank)
     with pytest.raises(UsageError, match=f"port {page.port} cannot be used"):
-        PageView(page.port, tracker)
+        PageView(page.port, None)
     text = urllib.request.urlopen(f"http://127.0.0.1:{page.port}/").read().decode()
     assert "://" not in text.replace("http://www.w3.org", "")  # nothing from elsewhere
     board = FakeBoard(printed, RATE_HZ)
@@ -430,7 +435,7 @@ def test_a_page_on_localhost_and_the_terminal_show_zones_residual_and_pose(bank,
     residual_mm = np.array(events[-1]["residual_mm"], float)
     assert np.nanmedian(np.abs(residual_mm)) < 10  # noise of the cone's pixels, some millimetres
     console = Console(width=120, record=True, file=io.StringIO())
-    console.print(drawn(Pictures(tracker.matcher).of(updates[-1]), "30/s"))
+    console.print(drawn(Pictures(tracker.matcher.bank).of(updates[-1]), "30/s"))
     shown = console.export_text()
     assert "heading" in shown
     assert "██" in shown
@@ -517,6 +522,70 @@ def test_the_command_replays_a_recording(bank, printed, tmp_path, capsys):
     assert rows[-1]["accepted"]
     assert main(["live", str(path), "--landmark", "cone"]) == 2
     assert "--landmark cone needs --sensor NAME" in capsys.readouterr().err
+
+
+def rig_drive():
+    """A drive of four sensors in a room, 8 stops of one frame, 0.2 s apart."""
+    wall_map, rig = room(box=[{"x_m": 1.1, "y_m": 1.5, "size_m": [0.4, 0.3, 1]}]), ring_rig(4)
+    angle = np.linspace(0.3, 1.3, 8)
+    path = np.column_stack([1.6 + 0.6 * np.cos(angle), 1.4 + 0.5 * np.sin(angle), angle + 1.5])
+    drive = simulated_recording(wall_map, rig, path, np.random.default_rng(4))
+    return wall_map, rig, path, replace(drive, time_s=drive.time_s + 0.2 * np.arange(8)[:, None])
+
+
+def test_a_rig_among_walls_is_followed_as_locate_follows_its_recording(tmp_path, capsys):
+    wall_map, rig, path, drive = rig_drive()
+    for name, text in (("room.toml", wall_map.to_toml()), ("rig.toml", rig.to_toml())):
+        (tmp_path / name).write_text(text)
+    (tmp_path / "drive.npz").write_bytes(recording_bytes(drive, rig))
+    files = ["--map", str(tmp_path / "room.toml"), "--rig", str(tmp_path / "rig.toml")]
+    assert main(["live", str(tmp_path / "drive.npz"), *files, "--at-once"]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    read = read_rig_recording(tmp_path / "drive.npz", rig)
+    expected = Locator(wall_map, rig).follow(read, {0: np.full(3, np.nan)})
+    assert [row["accepted"] for row in rows] == [one.accepted for one in expected]
+    assert sum(row["accepted"] for row in rows) >= 6
+    for row, one, true in zip(rows, expected, path, strict=True):
+        if one.accepted:
+            pose = [row["x_m"], row["y_m"], math.radians(row["heading_deg"])]
+            np.testing.assert_allclose(pose, one.pose, rtol=1e-12)
+            assert (np.abs(one.pose - true) < 5 * np.sqrt(np.diag(one.covariance))).all()
+    assert main(["live", "-", *files, "--landmark", "cone"]) == 2
+    assert "give --landmark" in capsys.readouterr().err
+
+
+def rig_lines(drive, names):
+    """Lines of JSON of a recording, one a sensor."""
+    for k in range(len(drive)):
+        x, y, yaw = drive.odometry[k]
+        for s, name in enumerate(names):
+            mm = [None if np.isnan(value) else 1e3 * value for value in drive.depth_m[k, 0, s].tolist()]
+            row = {
+                "sensor": name,
+                "t_ms": 1e3 * drive.time_s[k, 0],
+                "distances": mm,
+                "odometry": [x, y, math.degrees(yaw)],
+            }
+            yield json.dumps(row).encode() + b"\n"
+
+
+def test_lines_of_a_rig_s_sensors_are_frames_and_unknown_or_silent_sensors_are_told():
+    wall_map, rig, path, drive = rig_drive()
+    board = FakeBoard(rig_lines(drive, rig.names), 30)
+    source = open_rig_source(board.on_terminal(), rig)
+    updates, _ = run(source, MapTracker(Locator(wall_map, rig), 0.5, 1.0), until=lambda found: board.is_done.is_set())
+    board.unplug()
+    accepted = [one for one in updates if not one.reason]
+    assert len(accepted) >= 4  # of 8, some of which a busy machine may drop
+    for one in accepted:
+        off = one.located.estimate.pose - path[round(one.stamp_s / 0.2)]
+        assert (np.abs(off) < 5 * np.sqrt(np.diag(one.located.estimate.covariance))).all()
+    for names, message in ((("s0", "s1", "top"), "name the sensor 'top', the rig has s0, s1, s2, s3"),
+                           (("s0", "s1", "s0"), "none of 20 frames names the rig's sensor s2, s3")):  # fmt: skip
+        board = FakeBoard(list(rig_lines(drive, names)) * 3, 400)
+        with pytest.raises(UsageError, match=message):
+            run(open_rig_source(board.on_terminal(), rig), _SlowLocator(0.0))
+        board.unplug()
 
 
 @pytest.mark.soak

@@ -285,13 +285,13 @@ def json_lines(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of an object a line: distances in millimetres, optionally status codes and a time."""
     for number, text in log.lines():
         if text.startswith("{"):
-            log.frame = _of_object(number, text)
+            log.frame = of_object(number, text)
             yield from log.ended()
         else:
             log.other(number, text)
 
 
-def _of_object(number: int, text: str) -> Printed:
+def of_object(number: int, text: str) -> Printed:
     """Return the frame of a line of JSON."""
     frame = Printed(number)
     try:

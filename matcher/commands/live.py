@@ -7,7 +7,9 @@ from __future__ import annotations
 import math
 import signal
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,9 +21,11 @@ from phasemark.data.commands.options import Force, FrameReading, Json, MeshReadi
 from phasemark.matcher.commands.match_options import Landmark, Search
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from phasemark.data import Bank
     from phasemark.matcher.live import Live, Source, Tracker
-    from phasemark.render import Sensor
+    from phasemark.matcher.live.map_tracker import MapTracker
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,10 @@ class Motion:
 def live_poses(
     source: str,
     *,
-    landmark_name: Annotated[Path, Shown("--landmark", metavar="BANK|MESH|CLASS")],
+    landmark_name: Annotated[Path | None, Shown("--landmark", metavar="BANK|MESH|CLASS")] = None,
+    map_file: Annotated[Path | None, Shown("--map", metavar="TOML")] = None,
+    rig_file: Annotated[Path | None, Shown("--rig", metavar="TOML")] = None,
+    map_name: Annotated[str | None, Shown("--map-name", metavar="NAME")] = None,
     sensor: SensorName | None = None,
     distance: Annotated[str, Shown(metavar="FROM:TO")] = "0.3:1.5",
     to: Annotated[list[str] | None, Shown(metavar="SINK")] = None,
@@ -69,7 +76,7 @@ def live_poses(
     as_json: Json = False,
     force: Force = False,
 ) -> None:
-    """Follow the pose before a landmark from a board's stream, and publish it.
+    """Follow the pose before a landmark, or of a robot among walls, from a board's stream, and publish it.
 
     SOURCE is a serial port (/dev/ttyUSB0, or serial:///dev/ttyUSB0?baud=921600), - for standard input,
     tcp://HOST:PORT, udp://:PORT, zmq://HOST:PORT of a TMF8829, or a recording, which is replayed in time. A pose that
@@ -81,6 +88,12 @@ def live_poses(
         Where frames come from.
     landmark_name
         A bank; or a landmark, of which a bank is built and kept.
+    map_file
+        In place of a landmark: walls, boxes and landmarks, among which a rig of several sensors is followed.
+    rig_file
+        The sensors of that rig, which frames name.
+    map_name
+        Which map of a file with several.
     sensor
         Without a bank: a preset or sensor file.
     distance
@@ -97,20 +110,42 @@ def live_poses(
     from phasemark.matcher.live import Live, open_sink, open_source
 
     motion.check()
-    with _bank(landmark_name, mesh, sensor, distance) as bank:
-        camera = bank.camera
-        found = open_source(source, camera, vars(reading), in_time=not at_once)
-        sinks = [open_sink(name, camera, force=force) for name in to or ["-"]]
+    with ExitStack() as stack:
+        if landmark_name is not None and map_file is None and rig_file is None:
+            shown: Bank | None = (bank := stack.enter_context(_bank(landmark_name, mesh, sensor, distance)))
+            found = open_source(source, bank.camera, vars(reading), in_time=not at_once)
+            make: Any = partial(_tracker, bank, search, motion, found)
+        elif landmark_name is None and map_file is not None and rig_file is not None:
+            shown = None
+            found, make = _among_walls(source, rig_file, map_file, map_name, motion, not at_once)
+        else:
+            raise UsageError("give --landmark BANK|MESH|CLASS, or --map TOML and --rig TOML")
+        sinks = [open_sink(name, None if shown is None else shown.camera, force=force) for name in to or ["-"]]
         with LongWork("getting bank and kernels ready"):
-            tracker = _tracker(bank, search, motion, found)
+            tracker = make()
             tracker.warm()
-        sinks += _views(tracker, camera, page, view)
+        sinks += _views(shown, page, view)
         session = Live(found, tracker, sinks, delay_s=tracker.delay_s, say=lambda line: tell(f"note: {line}"))
         _until_interrupted(session, shows_status=not view and sys.stderr.isatty())
         if as_json:
             echo_json({"status": session.status.as_dict()})
         else:
             tell(f"note: {session.status.frames} frames, {session.status.accepted} poses published")
+
+
+def _among_walls(
+    source: str, rig_file: Path, map_file: Path, map_name: str | None, motion: Motion, in_time: bool
+) -> tuple[Source, Callable[[], MapTracker]]:
+    """Return the frames of a rig, and a function that makes what follows it."""
+    from phasemark.matcher.live.map_tracker import MapTracker
+    from phasemark.matcher.live.rig_frames import RecordedRig, open_rig_source
+    from phasemark.matcher.locate import Locator, read_rig, read_wall_map
+
+    rig = read_rig(rig_file)
+    found = open_rig_source(source, rig, in_time=in_time)
+    recorded_in = found.recording.map_name if isinstance(found, RecordedRig) else None
+    wall_map = read_wall_map(map_file, map_name or recorded_in)
+    return found, lambda: MapTracker(Locator(wall_map, rig), motion.speed, math.radians(motion.turn_rate))
 
 
 def _bank(name: Path, mesh: Landmark, sensor: str | None, distance: str) -> Bank:
@@ -171,18 +206,18 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
     )  # fmt: skip
 
 
-def _views(tracker: Tracker, camera: Sensor, page: int | None, view: bool) -> list[Any]:
+def _views(bank: Bank | None, page: int | None, view: bool) -> list[Any]:
     """Return the views of a session."""
     shown: list[Any] = []
     if page is not None:
         from phasemark.matcher.live.page import PageView
 
-        shown.append(PageView(page, tracker))
+        shown.append(PageView(page, bank))
         tell(f"note: http://127.0.0.1:{shown[-1].port}/")
     if view:
         from phasemark.matcher.live.terminal import TerminalView
 
-        shown.append(TerminalView(tracker))
+        shown.append(TerminalView(bank))
     return shown
 
 

@@ -52,8 +52,7 @@ class FoxgloveSink(Sink):
         """Send a pose, if it is accepted, and what is known."""
         found, now = update.located.estimate, int(update.time_s * 1e9)
         self._update.log(as_dict(update), log_time=now)
-        ranges = update.frames.range_m[0, 0]
-        rows = [[None if value != value else value for value in row] for row in ranges.tolist()]
+        rows = [[None if value != value else value for value in row] for row in update.zones_m.tolist()]
         self._zones.log({"range_m": rows}, log_time=now)
         if not update.reason and found.pose is not None:
             own, heading = self._messages, float(found.pose[2])
@@ -62,7 +61,8 @@ class FoxgloveSink(Sink):
                 orientation=own.Quaternion(x=0.0, y=0.0, z=math.sin(heading / 2), w=math.cos(heading / 2)),
             )
             stamp = own.Timestamp(sec=now // 10**9, nsec=now % 10**9)
-            self._pose.log(own.PoseInFrame(timestamp=stamp, frame_id="landmark", pose=pose), log_time=now)
+            frame = "map" if update.located.filtered is None else "landmark"
+            self._pose.log(own.PoseInFrame(timestamp=stamp, frame_id=frame, pose=pose), log_time=now)
 
     def status(self, status: Status) -> None:
         """Send the status."""

@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from phasemark import InputFileError
 from phasemark.matcher.live.extras import needed
 from phasemark.matcher.live.sinks import Sink, as_dict, open_output
-from phasemark.matcher.live.sources import Arrival, Source
+from phasemark.matcher.live.sources import Replay
 from phasemark.render import Frames, Sensor
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class McapSink(Sink):
     def update(self, update: Update) -> None:
         """Write a frame with all that was concluded."""
         located = update.located
-        self._write("frames", update, {"index": update.number, **_frame_dict(update.frames)})
+        self._write("frames", update, {"index": update.number, **_frame_dict(cast(Frames, update.frames))})
         match = {} if located.match is None else located.match.as_dict()
         self._write("matches", update, {"index": update.number, "searched": located.searched, **match})
         self._write("poses", update, as_dict(update))
@@ -76,7 +76,7 @@ class McapSink(Sink):
         self._file.close()
 
 
-class McapSource(Source):
+class McapSource(Replay):
     """Frames of a log that :class:`McapSink` wrote, with the stamps and the numbers that they had.
 
     Parameters
@@ -88,11 +88,9 @@ class McapSource(Source):
         Whether frames come in the rhythm of their stamps.
     """
 
-    is_live = False
-
     def __init__(self, path: Path, sensor: Sensor, *, in_time: bool) -> None:
-        super().__init__(str(path))
-        self._path, self._sensor, self._in_time, self._stopped = path, sensor, in_time, False
+        super().__init__(str(path), in_time)
+        self._path, self._sensor = path, sensor
         self._rows = self._read("/frames")
         if not self._rows:
             raise InputFileError(f"{path}: holds no frames of a live session")
@@ -113,23 +111,11 @@ class McapSource(Source):
         rows = self._read("/matches")
         return {row["index"]: row["searched"] for row in rows if row.get("searched") is not None}
 
-    def frames(self) -> Iterator[Arrival]:
+    def recorded(self) -> Iterator[tuple[Frames, float | None]]:
         """Yield the frames."""
-        began, first = time.monotonic(), None
         for row in self._rows:
             frames = _frames_of(row, self._sensor, self._path)
-            stamp = None if frames.time_s is None else float(frames.time_s.flat[0])
-            first = stamp if first is None else first
-            if self._in_time and stamp is not None and first is not None:
-                while not self._stopped and time.monotonic() < began + stamp - first:
-                    time.sleep(min(max(began + stamp - first - time.monotonic(), 0.0), 0.05))
-            if self._stopped:
-                return
-            yield Arrival(frames, time.monotonic())
-
-    def stop(self) -> None:
-        """Let the frames end."""
-        self._stopped = True
+            yield frames, None if frames.time_s is None else float(frames.time_s.flat[0])
 
 
 def _frame_dict(frames: Frames) -> dict[str, Any]:

@@ -10,11 +10,11 @@ from importlib.resources import files
 from typing import Any
 
 from phasemark import UsageError
+from phasemark.data import Bank
 from phasemark.matcher.live.picture import Pictures
 from phasemark.matcher.live.session import Update
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.status import Status
-from phasemark.matcher.live.tracker import Tracker
 
 _EVERY_S = 0.1
 
@@ -26,7 +26,8 @@ class PageView(Sink):
     ----------
     port : int
         Of 127.0.0.1; 0 takes a free one.
-    tracker : Tracker
+    bank : Bank or None
+        Landmarks that are rendered; None of a rig among walls.
 
     Attributes
     ----------
@@ -38,9 +39,9 @@ class PageView(Sink):
         The port is taken.
     """
 
-    def __init__(self, port: int, tracker: Tracker) -> None:
+    def __init__(self, port: int, bank: Bank | None) -> None:
         super().__init__("page")
-        self._pictures = Pictures(tracker.matcher)
+        self._pictures = Pictures(bank)
         self._changed, self._event, self._watchers = threading.Condition(), "", 0
         self._facts: dict[str, Any] = {}
         self._next_s, self._is_over = 0.0, False

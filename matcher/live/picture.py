@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.data import Bank
 from phasemark.matcher.live.session import Update
 from phasemark.matcher.live.sinks import as_dict
-from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.robot_pose import PRIOR_STD
 from phasemark.render import Renderer, Views
 from phasemark.render.phasor_images import wrap_difference_m
@@ -26,35 +26,34 @@ class Pictures:
 
     Parameters
     ----------
-    matcher : Matcher
-        Its bank has the landmarks that are rendered beside what was measured.
+    bank : Bank or None
+        Has the landmarks that are rendered beside what was measured; None of a rig among walls.
     """
 
-    def __init__(self, matcher: Matcher) -> None:
-        self._bank = matcher.bank
+    def __init__(self, bank: Bank | None) -> None:
+        self._bank = bank
         self._renderers: dict[str, Renderer] = {}
 
     def of(self, update: Update) -> dict[str, Any]:
         """Return zones and residuals, rows from the top, None where there is none, and the pose as JSON has it."""
-        range_m = update.frames.range_m[0, 0]
-        found: dict[str, Any] = {**as_dict(update), "range_m": _plain(range_m), "residual_mm": None}
+        found: dict[str, Any] = {**as_dict(update), "range_m": _plain(update.zones_m), "residual_mm": None}
         found["poses"] = [[round(share, 4), *pose.round(4).tolist()] for share, pose in update.located.estimate.poses]
         if not update.reason:
             found["std"] = np.sqrt(np.diag(found["covariance"])).tolist()
-        match = update.located.match
-        if match is not None and match.class_name is not None and math.isfinite(match.distance_m):
-            residual_m = wrap_difference_m(update.located.filtered.range_m[0] - self._model(match), self._bank.sensor)
+        match, frames, bank = update.located.match, update.located.filtered, self._bank
+        if bank and frames and match and match.class_name is not None and math.isfinite(match.distance_m):
+            residual_m = wrap_difference_m(frames.range_m[0] - self._model(bank, match), bank.sensor)
             residual_m = np.where(np.abs(residual_m) > _MOST_M, np.nan, residual_m)
-            found["residual_mm"] = _plain(1e3 * (residual_m - self._bank.camera.range_offset_m))
+            found["residual_mm"] = _plain(1e3 * (residual_m - bank.camera.range_offset_m))
             found["class"] = match.class_name
         return found
 
-    def _model(self, match: Any) -> NDArray[np.float64]:
+    def _model(self, bank: Bank, match: Any) -> NDArray[np.float64]:
         """Return the range image of a match's view."""
         name = match.class_name
         if name not in self._renderers:
-            mesh = self._bank.mesh(name)
-            self._renderers[name] = Renderer(mesh, self._bank.sensor, albedo=float(mesh.metadata["albedo"]))
+            mesh = bank.mesh(name)
+            self._renderers[name] = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"]))
         views = Views.broadcast(*(getattr(match, field) for field in VIEW_FIELDS))
         return np.asarray(self._renderers[name].render_views(views, background=match.background).range_m[0])
 

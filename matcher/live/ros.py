@@ -39,13 +39,16 @@ class RosSink(Sink):
     name : str
     below : str
         NAME of the topics; the frames are NAME_landmark and NAME_camera.
+    in_map : bool
+        Whether poses are those of a robot in a map: frame NAME_map, and no landmark_pose.
     """
 
-    def __init__(self, name: str, below: str) -> None:
+    def __init__(self, name: str, below: str, *, in_map: bool = False) -> None:
         super().__init__(name)
         from phasemark.matcher.live import ros_types
 
-        self._types, self._frames = ros_types, (f"{below}_landmark", f"{below}_camera")
+        self._types, self._in_map = ros_types, in_map
+        self._frames = f"{below}_{'map' if in_map else 'landmark'}", f"{below}_camera"
         domain = needed("cyclonedds.domain", "the sink 'ros'", "dds")
         number = os.environ.get("ROS_DOMAIN_ID", "0")
         if not number.isdigit() or int(number) > 232:
@@ -72,7 +75,8 @@ class RosSink(Sink):
         found = update.located.estimate
         if not update.reason and found.pose is not None and found.covariance is not None:
             self._pose.write(self.pose_message(found.pose, found.covariance, update.time_s))
-            self._landmark.write(self.landmark_message(found.pose, update.time_s))
+            if not self._in_map:
+                self._landmark.write(self.landmark_message(found.pose, update.time_s))
 
     def status(self, status: Status) -> None:
         """Publish the status."""

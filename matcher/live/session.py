@@ -7,10 +7,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.sources import Arrival, Source, SourceFault
 from phasemark.matcher.live.status import Status
 from phasemark.matcher.live.tracker import Located, Locator
+from phasemark.matcher.locate.recording import RigRecording
 from phasemark.render import Frames
 
 _RETRY_S = 0.2
@@ -29,7 +33,7 @@ class Update:
     ----------
     number : int
         Of the frame, from 0.
-    frames : Frames
+    frames : Frames or RigRecording
         The frame.
     stamp_s : float
         Its stamp on the source's clock; when it arrived where the source has none.
@@ -46,13 +50,19 @@ class Update:
     """
 
     number: int
-    frames: Frames
+    frames: Frames | RigRecording
     stamp_s: float
     pose_stamp_s: float
     time_s: float
     located: Located
     reason: str
     latency_s: float
+
+    @property
+    def zones_m(self) -> NDArray[np.float64]:
+        """Ranges as a grid, or a row for each sensor of a rig."""
+        own = self.frames
+        return np.asarray(own.range_m[0, 0] if isinstance(own, Frames) else own.depth_m[0, -1])
 
 
 class _Newest:

@@ -104,7 +104,7 @@ def planar_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     return whole
 
 
-def open_sink(name: str, sensor: Sensor, *, force: bool = False) -> Sink:
+def open_sink(name: str, sensor: Sensor | None, *, force: bool = False) -> Sink:
     """Return the sink that a name stands for.
 
     Parameters
@@ -113,8 +113,8 @@ def open_sink(name: str, sensor: Sensor, *, force: bool = False) -> Sink:
         ``jsonl:FILE``, or ``-`` for standard output: lines of JSON. ``ros``, ``ros:NAME``: topics of ROS 2 below NAME.
         ``mavlink:udpout:HOST:PORT`` or another address of pymavlink. ``mcap:FILE``: a log of everything.
         ``foxglove`` or ``foxglove://HOST:PORT``: a server that Foxglove shows.
-    sensor : Sensor
-        The camera.
+    sensor : Sensor or None
+        The camera; None of a rig among walls.
     force : bool
         Whether an existing file may be replaced.
 
@@ -135,12 +135,14 @@ def open_sink(name: str, sensor: Sensor, *, force: bool = False) -> Sink:
     if kind == "ros":
         from phasemark.matcher.live.ros import RosSink
 
-        return RosSink(name, rest or "phasemark")
+        return RosSink(name, rest or "phasemark", in_map=sensor is None)
     if kind == "mavlink" and rest:
         from phasemark.matcher.live.mavlink import MavlinkSink
 
         return MavlinkSink(name, rest)
     if kind == "mcap" and rest:
+        if sensor is None:
+            raise UsageError(f"{name}: logs frames before a landmark; a rig's poses go to jsonl:FILE")
         from phasemark.matcher.live.mcap_log import McapSink
 
         return McapSink(name, Path(rest), sensor, force=force)

@@ -23,11 +23,12 @@ from phasemark.data.measured.reading import frames_of, read_frames, shape_before
 from phasemark.data.measured.recording import Recording
 from phasemark.matcher.live.extras import needed
 from phasemark.matcher.live.streams import Lines, Stream, address_of, open_stream
+from phasemark.matcher.locate.recording import RigRecording
 from phasemark.render import Frames, Sensor
 
 STALLS_AFTER_S = 1.0
 """A source that sends nothing for longer is opened again."""
-_LONGEST_LINE = 1 << 16
+LONGEST_LINE = 1 << 16
 _HEADER = re.compile(r"(^|[;,\t ])\"?(mm|range|z)_0\"?([;,\t ]|$)")
 _UNRECOGNISED_LINES = 256
 """Lines after which a source is said to be of no known format."""
@@ -43,13 +44,13 @@ class Arrival:
 
     Parameters
     ----------
-    frames : Frames
-        One position with one frame; its stamp is the source's, if it has any.
+    frames : Frames or RigRecording
+        One position with one frame, or one stop of a rig; its stamp is the source's, if it has any.
     received_s : float
         When its last byte arrived, on the monotonic clock.
     """
 
-    frames: Frames
+    frames: Frames | RigRecording
     received_s: float
 
 
@@ -95,26 +96,18 @@ class Source(ABC):
         self.n_damaged, self.damage = self.n_damaged + n, damage
 
 
-class PrintedSource(Source):
-    """Lines that a board prints, or lines of CSV, read from a stream.
+class StreamSource(Source):
+    """Frames of the lines that arrive on a stream.
 
     Parameters
     ----------
     stream : Stream
-    sensor : Sensor
-    how : mapping
-        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean.
     """
 
-    def __init__(self, stream: Stream, sensor: Sensor, how: Mapping[str, Any]) -> None:
+    def __init__(self, stream: Stream) -> None:
         super().__init__(stream.name)
-        self._stream, self._sensor = stream, sensor
-        self._how = {key: value for key, value in how.items() if key != "board"}
-        self._named: str | None = how.get("board")
-        self._shape = shape_before(sensor, int(how.get("rotate", 0)))
-        self._path = Path(self.name)
+        self._stream = stream
         self._lines: Lines | None = None
-        self._header = b""
 
     def frames(self) -> Iterator[Arrival]:
         """Open the stream and yield its frames."""
@@ -136,6 +129,31 @@ class PrintedSource(Source):
         """Let the lines end."""
         if self._lines is not None:
             self._lines.is_stopped = True
+
+    @abstractmethod
+    def _parsed(self, lines: Lines) -> Iterator[Arrival]:
+        """Yield the frames of lines until these end."""
+
+
+class PrintedSource(StreamSource):
+    """Lines that a board prints, or lines of CSV, read from a stream.
+
+    Parameters
+    ----------
+    stream : Stream
+    sensor : Sensor
+    how : mapping
+        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean.
+    """
+
+    def __init__(self, stream: Stream, sensor: Sensor, how: Mapping[str, Any]) -> None:
+        super().__init__(stream)
+        self._sensor = sensor
+        self._how = {key: value for key, value in how.items() if key != "board"}
+        self._named: str | None = how.get("board")
+        self._shape = shape_before(sensor, int(how.get("rotate", 0)))
+        self._path = Path(self.name)
+        self._header = b""
 
     def _parsed(self, lines: Lines) -> Iterator[Arrival]:
         board, first = self._recognised(lines)
@@ -163,7 +181,7 @@ class PrintedSource(Source):
             return BOARDS[self._named], []
         held: list[bytes] = []
         n_pixels = math.prod(self._shape) * len(self._sensor.frequencies_hz)
-        while line := lines.readline(_LONGEST_LINE):
+        while line := lines.readline(LONGEST_LINE):
             held.append(line)
             board = find_board(self._named, b"".join(held), math.prod(self._shape), self._path)
             if board is not None:
@@ -193,7 +211,7 @@ class PrintedSource(Source):
     def _of_csv(self, lines: Lines, first: list[bytes]) -> Iterator[Arrival]:
         """Yield the frames of lines of CSV, below a header or without one."""
         pending = list(first)
-        while line := pending.pop() if pending else lines.readline(_LONGEST_LINE):
+        while line := pending.pop() if pending else lines.readline(LONGEST_LINE):
             text = prints.plain(line)
             if _HEADER.search(text):
                 self._header = line
@@ -301,8 +319,44 @@ class Tmf8829Source(Source):
         raise InputFileError(f"{self.name}: a message without results")
 
 
-class RecordedSource(Source):
-    """Recording whose frames come in the rhythm of their stamps, or as fast as they are taken.
+class Replay(Source):
+    """Recorded frames in the rhythm of their stamps, or as fast as they are taken.
+
+    Parameters
+    ----------
+    name : str
+    in_time : bool
+    """
+
+    is_live = False
+
+    def __init__(self, name: str, in_time: bool) -> None:
+        super().__init__(name)
+        self._in_time, self._stopped = in_time, False
+
+    @abstractmethod
+    def recorded(self) -> Iterator[tuple[Any, float | None]]:
+        """Yield frames with their times, if they have any."""
+
+    def frames(self) -> Iterator[Arrival]:
+        """Yield the frames."""
+        began, first = time.monotonic(), None
+        for frames, stamp in self.recorded():
+            if self._in_time and stamp is not None:
+                first = stamp if first is None else first
+                while not self._stopped and (ahead := began + stamp - first - time.monotonic()) > 0:
+                    time.sleep(min(ahead, 0.05))
+            if self._stopped:
+                return
+            yield Arrival(frames, time.monotonic())
+
+    def stop(self) -> None:
+        """Let the frames end."""
+        self._stopped = True
+
+
+class RecordedSource(Replay):
+    """Recording of a camera.
 
     Parameters
     ----------
@@ -313,30 +367,15 @@ class RecordedSource(Source):
     in_time : bool
     """
 
-    is_live = False
-
     def __init__(self, path: Path, sensor: Sensor, how: Mapping[str, Any], *, in_time: bool) -> None:
-        super().__init__(str(path))
+        super().__init__(str(path), in_time)
         self._recorded = read_frames(path, sensor=sensor, untrusted=True, **how).each_a_position()
-        self._in_time, self._stopped = in_time, False
 
-    def frames(self) -> Iterator[Arrival]:
-        """Yield the frames."""
-        stamps = self._recorded.time_s
-        began = time.monotonic()
+    def recorded(self) -> Iterator[tuple[Frames, float]]:
+        """Yield the frames, with times at the frame rate where they have none."""
+        stamps, period_s = self._recorded.time_s, 1 / (self._recorded.sensor.frame_rate_hz or 15.0)
         for k in range(len(self._recorded)):
-            if self._in_time:
-                period = 1 / (self._recorded.sensor.frame_rate_hz or 15.0)
-                due = began + (k * period if stamps is None else float(stamps[k, 0] - stamps[0, 0]))
-                while not self._stopped and time.monotonic() < due:
-                    time.sleep(min(max(due - time.monotonic(), 0.0), 0.05))
-            if self._stopped:
-                return
-            yield Arrival(self._recorded[k : k + 1], time.monotonic())
-
-    def stop(self) -> None:
-        """Let the frames end."""
-        self._stopped = True
+            yield self._recorded[k : k + 1], k * period_s if stamps is None else float(stamps[k, 0])
 
 
 def open_source(name: str, sensor: Sensor, how: Mapping[str, Any] | None = None, *, in_time: bool = True) -> Source:

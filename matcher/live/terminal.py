@@ -11,11 +11,11 @@ from rich.live import Live as Screen
 from rich.table import Table
 from rich.text import Text
 
+from phasemark.data import Bank
 from phasemark.matcher.live.picture import Pictures
 from phasemark.matcher.live.session import Update
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.status import Status
-from phasemark.matcher.live.tracker import Tracker
 
 _EVERY_S = 0.2
 """Time between two pictures: each renders the landmark once."""
@@ -47,13 +47,14 @@ class TerminalView(Sink):
 
     Parameters
     ----------
-    tracker : Tracker
+    bank : Bank or None
+        Landmarks that are rendered; None of a rig among walls.
     console : rich.console.Console, optional
     """
 
-    def __init__(self, tracker: Tracker, console: Console | None = None) -> None:
+    def __init__(self, bank: Bank | None, console: Console | None = None) -> None:
         super().__init__("view")
-        self._pictures = Pictures(tracker.matcher)
+        self._pictures = Pictures(bank)
         self._screen = Screen(console=console or Console(stderr=True), auto_refresh=False, transient=False)
         self._screen.start()
         self._next_s, self._line = 0.0, ""

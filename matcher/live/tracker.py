@@ -34,7 +34,7 @@ class Located:
     estimate : Estimate
     match : Match or None
         Answer of the matcher for this frame.
-    filtered : FilteredFrames
+    filtered : FilteredFrames or None
         The frame as it was matched.
     tracked : bool
         Whether it was matched from an expected view, not searched.
@@ -46,23 +46,31 @@ class Located:
 
     estimate: Estimate
     match: Match | None
-    filtered: FilteredFrames
+    filtered: FilteredFrames | None
     tracked: bool = False
     searched: int | None = None
     note: str = ""
 
 
 class Locator(Protocol):
-    """Interface of what finds a pose in a frame: a landmark's :class:`Tracker`, or a localiser in a map."""
+    """Interface of what finds a pose in a frame: a landmark's :class:`Tracker`, or a map's :class:`MapTracker`."""
 
-    def locate(self, frames: Frames, stamp_s: float) -> Located:
-        """Return the pose at the time of a frame, one position with one frame; stamps run forward but for jumps."""
+    def locate(self, frames: Any, stamp_s: float) -> Located:
+        """Return the pose at the time of one frame of the source; stamps run forward but for jumps."""
 
     def warm(self) -> None:
         """Compile and make what the first frame needs."""
 
     def close(self) -> None:
         """End what runs beside."""
+
+
+def step_between(before_s: float | None, stamp_s: float) -> tuple[float, bool, str]:
+    """Return the time between two stamps, whether it is a jump that makes the pose unknown, and what is wrong."""
+    step_s = 0.0 if before_s is None else stamp_s - before_s
+    if not -1.0 < step_s <= _CHECKED_S:
+        return 0.0, True, f"the source's clock jumps by {step_s:.1f} s" if step_s < 0 else ""
+    return max(step_s, 0.0), False, "" if step_s >= 0 else f"a stamp runs back by {-step_s:.3f} s"
 
 
 class Tracker:
@@ -158,17 +166,15 @@ class Tracker:
 
     def _move(self, stamp_s: float, reading: Reading | None) -> str:
         """Let time pass up to a stamp, and return what is wrong with it; a jump of the clock forgets the pose."""
-        before, self._stamp_s = self._stamp_s, stamp_s
-        if before is None:
-            return ""
-        step_s = stamp_s - before
-        if -1.0 < step_s <= _CHECKED_S:
-            self.estimator.move(reading or Reading(0.0, 0.0, max(step_s, 0.0)))
-            self._stamp_s = max(stamp_s, before)
-            return "" if step_s >= 0 else f"a stamp runs back by {-step_s:.3f} s"
-        self.estimator.forget()
-        self._tracked_s = -math.inf
-        return f"the source's clock jumps by {step_s:.1f} s" if step_s < 0 else ""
+        step_s, jumps, note = step_between(self._stamp_s, stamp_s)
+        if jumps:
+            self.estimator.forget()
+            self._tracked_s = -math.inf
+        elif self._stamp_s is not None:
+            self.estimator.move(reading or Reading(0.0, 0.0, step_s))
+            stamp_s = max(stamp_s, self._stamp_s)
+        self._stamp_s = stamp_s
+        return note
 
     def _expected(self) -> list[Match]:
         """Return the views that are expected, as answers like the last one."""

@@ -205,7 +205,7 @@ class Locator:
         recording : RigRecording
             With odometry at its stops.
         start : mapping of int to (3,) array_like, optional
-            First pose of each robot; that of the odometry where it is left out.
+            First pose of each robot; that of the odometry where it is left out. NaN: the whole map is searched.
         start_std : (3,) array_like
 
         Returns
@@ -227,19 +227,30 @@ class Locator:
         for robot in np.unique(recording.robot):
             own = np.flatnonzero(recording.robot == robot)
             mean = np.asarray((start or {}).get(int(robot), recording.odometry[own[0]]), np.float64)
-            covariance = first
+            prior = (mean, first) if np.isfinite(mean).all() else None
             for k, before in zip(own, [None, *own[:-1]], strict=True):
-                if before is not None:
+                if before is not None and prior is not None:
                     step = relative_pose(recording.odometry[before], recording.odometry[k])
-                    mean, covariance = self.rig.odometry.moved(mean, covariance, step)
-                answer = self._located(recording, int(k), (mean, covariance))
-                if not answer.accepted and answer.reason in ("poor fit", "ambiguous"):
-                    anywhere = self._located(recording, int(k), None)
-                    answer = anywhere if anywhere.accepted else answer
-                if answer.accepted:
-                    mean, covariance = answer.pose, answer.covariance
-                answers[int(k)] = answer
+                    prior = self.rig.odometry.moved(*prior, step)
+                answers[int(k)], prior = self.locate_next(recording, int(k), prior)
         return [answers[k] for k in range(len(recording))]
+
+    def locate_next(
+        self, recording: RigRecording, k: int, prior: tuple[_Float, _Float] | None
+    ) -> tuple[LocatedPose, tuple[_Float, _Float] | None]:
+        """Locate a stop from where the robot is expected, in the whole map where that fails, or without a prior.
+
+        Returns
+        -------
+        LocatedPose
+        prior : (mean, covariance) or None
+            What is known of the pose then.
+        """
+        answer = self._located(recording, k, prior)
+        if prior is not None and answer.reason in ("poor fit", "ambiguous"):
+            anywhere = self._located(recording, k, None)
+            answer = anywhere if anywhere.accepted else answer
+        return answer, (answer.pose, answer.covariance) if answer.accepted else prior
 
     def _located(self, recording: RigRecording, k: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
         """Locate one stop; `prior`: mean and covariance."""

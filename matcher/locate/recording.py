@@ -43,7 +43,7 @@ class RigRecording:
     depth_m : (n, F, S, C) float64
         Along the boresight, sensors in the order of the rig; NaN where there is none.
     time_s : (n, F) float64
-        Since the first frame of the stop.
+        Times of the frames.
     moved : (n, F, 3) float64
         Odometry since the first frame, in the body's frame there: x, y (m), yaw (rad).
     odometry : (n, 3) float64, optional
@@ -76,8 +76,14 @@ class RigRecording:
     def scan(self, k: int, frames: Sequence[int] | None = None) -> Scan:
         """Return the frames of a stop, or some of them."""
         used = np.arange(self.depth_m.shape[1]) if frames is None else np.asarray(frames)
-        depth = np.ascontiguousarray(self.depth_m[k][used])
-        return Scan(self.time_s[k][used], depth, self.time_s[k].copy(), np.ascontiguousarray(self.moved[k]))
+        depth, time_s = np.ascontiguousarray(self.depth_m[k][used]), self.time_s[k] - self.time_s[k, 0]
+        return Scan(time_s[used], depth, time_s, np.ascontiguousarray(self.moved[k]))
+
+    def one(self, k: int) -> Self:
+        """Return the recording of one stop alone."""
+        own = slice(k, k + 1)
+        cut = {name: getattr(self, name)[own] for name in ("depth_m", "time_s", "moved", "stop", "robot", "notes")}
+        return replace(self, **cut, odometry=None if self.odometry is None else self.odometry[own])
 
     def first_frames(self, n: int) -> Self:
         """Return the recording with the first n frames of each stop; the odometry stays."""
@@ -116,8 +122,11 @@ def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
         The file cannot be read, an array is missing or of a wrong shape, times do not rise, or the recording lacks a
         sensor of the rig.
     """
-    path = Path(path)
-    arrays = _arrays(path)
+    return rig_recording(_arrays(Path(path)), Path(path), rig)
+
+
+def rig_recording(arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> RigRecording:
+    """Return the recording that the arrays of a file or of another source hold; parameters and errors as above."""
     name = next((name for name in ("z_m", "range_m") if name in arrays), None)
     if name is None:
         raise InputFileError(f"{path}: must have an array 'z_m' or 'range_m', got {', '.join(arrays) or 'nothing'}")
@@ -145,7 +154,7 @@ def read_rig_recording(path: str | os.PathLike[str], rig: Rig) -> RigRecording:
         for key, default in (("stop", np.arange(n)), (robot_key, np.zeros(n)))
     )
     run = str(arrays["run"]) if "run" in arrays else path.stem
-    recording = RigRecording(depth, np.ascontiguousarray(time_s - time_s[:, :1]), moved, odometry, stop, robot, run,
+    recording = RigRecording(depth, np.ascontiguousarray(time_s), moved, odometry, stop, robot, run,
                              str(arrays["map"]) if "map" in arrays else None, robot_key)  # fmt: skip
     return _judged(recording, rig)
 

@@ -1,0 +1,151 @@
+"""Frames of a rig of several sensors: lines that name their sensor, and recordings replayed stop by stop."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from phasemark import InputFileError, UsageError
+from phasemark.data.measured.board_prints import of_object, plain
+from phasemark.matcher.live.sources import LONGEST_LINE, Arrival, Replay, StreamSource
+from phasemark.matcher.live.streams import Lines, Stream, open_stream
+from phasemark.matcher.locate import Rig, RigRecording, read_rig_recording
+from phasemark.matcher.locate.recording import rig_recording
+
+_SILENT_FRAMES = 20
+"""Frames after which a sensor that none has named is missed."""
+_BETWEEN_STOPS_S = 1.0
+"""Time between stops whose recording has none."""
+
+
+class RigLines(StreamSource):
+    """Lines of JSON, each the zones of one sensor: ``sensor``, ``distances`` in mm; ``status``, ``t_ms`` if known.
+
+    Lines with the same time are a frame, without times those up to a sensor that comes again. ``odometry``, [x_m, y_m,
+    yaw_deg], may be on any of them.
+
+    Parameters
+    ----------
+    stream : Stream
+    rig : Rig
+    """
+
+    def __init__(self, stream: Stream, rig: Rig) -> None:
+        super().__init__(stream)
+        self._rig, self._heard, self._n_frames = rig, set[str](), 0
+
+    def _parsed(self, lines: Lines) -> Iterator[Arrival]:
+        held: dict[str, dict[str, Any]] = {}
+        while line := lines.readline(LONGEST_LINE):
+            text = plain(line)
+            if not text.startswith("{"):
+                continue
+            try:
+                row = self._row(text)
+                if row["sensor"] in held or any(one["time_s"] != row["time_s"] for one in held.values()):
+                    yield self._frame(held, lines)
+                    held = {}
+                held[row["sensor"]] = row
+                if len(held) == len(self._rig.names):
+                    yield self._frame(held, lines)
+                    held = {}
+            except InputFileError as error:
+                held = {}
+                self.spoilt(str(error))
+
+    def _row(self, text: str) -> dict[str, Any]:
+        """Return what a line holds: the sensor, zones in metres, their status, a time and the odometry, if any."""
+        printed, columns = of_object(0, text), int(self._rig.numbers().columns.max())
+        n = len(printed.distance_mm)
+        if printed.damage or not n or n % columns:
+            raise InputFileError(f"{self.name}: {printed.damage or f'{n} zones, must be rows of {columns}'}")
+        given = json.loads(text)
+        name, odometry = given.get("sensor"), given.get("odometry")
+        if name not in self._rig.names:
+            raise UsageError(f"{self.name}: frames name the sensor {name!r}, the rig has {', '.join(self._rig.names)}")
+        if odometry is not None:
+            try:
+                odometry = np.array(odometry, np.float64).reshape(3) * [1, 1, np.radians(1)]
+            except (TypeError, ValueError):
+                raise InputFileError(f"{self.name}: 'odometry' must be [x_m, y_m, yaw_deg]") from None
+        shape = (n,) if n == columns else (n // columns, columns)
+        status = printed.status or [self._rig.reduction.valid_status[0]] * n
+        zones = 1e-3 * np.reshape(printed.distance_mm, shape)
+        return {"sensor": name, "z_m": zones, "status": np.reshape(status, shape), "time_s": printed.time_s,
+                "odometry": odometry}  # fmt: skip
+
+    def _frame(self, held: dict[str, dict[str, Any]], lines: Lines) -> Arrival:
+        """Return lines of several sensors as one frame, invalid where a sensor sent nothing."""
+        names, last = self._rig.names, list(held.values())[-1]
+        self._heard |= held.keys()
+        self._n_frames += 1
+        if self._n_frames >= _SILENT_FRAMES and (silent := [name for name in names if name not in self._heard]):
+            raise UsageError(
+                f"{self.name}: none of {self._n_frames} frames names the rig's sensor {', '.join(silent)}, they name"
+                f" {', '.join(self._heard)}"
+            )
+        if len({row["z_m"].shape for row in held.values()}) > 1:
+            raise InputFileError(f"{self.name}: sensors of a frame have different numbers of zones")
+        missing = {"z_m": np.full(last["z_m"].shape, np.nan), "status": last["status"]}
+        arrays = {key: np.array([[[held.get(name, missing)[key] for name in names]]]) for key in missing}
+        stamp = time.time() if last["time_s"] is None else last["time_s"]
+        arrays |= {"sensor": np.array(names), "frame_time_s": np.array([stamp])}
+        odometry = next((row["odometry"] for row in reversed(held.values()) if row["odometry"] is not None), None)
+        if odometry is not None:
+            axes = ("odometry_x_m", "odometry_y_m", "odometry_yaw_rad")
+            arrays |= {key: np.array([value]) for key, value in zip(axes, odometry, strict=True)}
+        return Arrival(rig_recording(arrays, Path(self.name), self._rig), lines.received_s)
+
+
+class RecordedRig(Replay):
+    """Recording of a rig, stop by stop.
+
+    Parameters
+    ----------
+    path : Path
+    rig : Rig
+    in_time : bool
+
+    Raises
+    ------
+    InputFileError
+        It cannot be read, lacks a sensor of the rig, or has several robots.
+    """
+
+    def __init__(self, path: Path, rig: Rig, *, in_time: bool) -> None:
+        super().__init__(str(path), in_time)
+        found = read_rig_recording(path, rig)
+        robots = np.unique(found.robot)
+        if len(robots) > 1:
+            raise InputFileError(f"{path}: has robots {', '.join(map(str, robots))}, must be of one that is followed")
+        if (np.diff(found.time_s[:, 0]) <= 0).any():
+            step_s = float(np.ptp(found.time_s, axis=1).max()) + _BETWEEN_STOPS_S
+            found = replace(found, time_s=found.time_s + step_s * np.arange(len(found))[:, None])
+        self.recording: RigRecording = found
+
+    def recorded(self) -> Iterator[tuple[RigRecording, float | None]]:
+        """Yield the stops."""
+        for k in range(len(self.recording)):
+            yield self.recording.one(k), float(self.recording.time_s[k, 0])
+
+
+def open_rig_source(name: str, rig: Rig, *, in_time: bool = True) -> RigLines | RecordedRig:
+    """Return the source of a rig's frames that a name stands for: a stream of lines, or a recording (.npz).
+
+    Raises
+    ------
+    UsageError, InputFileError
+        There is no source of this name, or the recording cannot be read.
+    """
+    stream = open_stream(name)
+    if stream is not None:
+        return RigLines(stream, rig)
+    if "://" in name:
+        raise UsageError(f"{name}: a rig's source must begin with serial://, tcp:// or udp://, or be a file")
+    return RecordedRig(Path(name), rig, in_time=in_time)
