@@ -39,6 +39,10 @@ def brute_force_depth(outline, pose, azimuth, step, footprint=2.5, rays=6001):
     return np.average(nearest, weights=1 - np.abs(tau - centre) / width)
 
 
+def model_of(rig, wall_map):
+    return StopModel(rig, wall_map.outline(), rig.numbers())
+
+
 def scan_of(pose_count=4, columns=8, frames=3):
     time_s = np.arange(frames) / 10
     track = np.column_stack([0.1 * time_s, -0.05 * time_s, 0.5 * time_s])
@@ -46,7 +50,7 @@ def scan_of(pose_count=4, columns=8, frames=3):
 
 
 def test_the_depth_of_a_column_is_the_mean_over_its_footprint():
-    model = StopModel.of(ring_rig(4), room(wall=[POST]).outline())
+    model = model_of(ring_rig(4), room(wall=[POST]))
     theta = np.zeros(14)
     theta[:3] = [1.0, 0.8, 0.4]
     seen = model.prediction(theta, scan_of(frames=1))
@@ -62,7 +66,7 @@ def test_the_depth_of_a_column_is_the_mean_over_its_footprint():
 
 
 def test_slopes_are_those_of_the_depths_also_where_a_wall_ends_in_a_footprint():
-    model = StopModel.of(ring_rig(4), room(wall=[POST]).outline())
+    model = model_of(ring_rig(4), room(wall=[POST]))
     rng, step = np.random.default_rng(3), 1e-6
     for _ in range(5):
         theta = np.concatenate([[rng.uniform(0.4, 1.2), rng.uniform(0.4, 2.5), rng.uniform(-3, 3)],
@@ -83,12 +87,11 @@ def test_slopes_of_walls_are_those_of_a_map_whose_wall_is_displaced():
     base, step = room(wall=[POST | {"thickness_m": 0.0}]), 1e-6
     rig, theta = ring_rig(4), np.zeros(14)
     theta[:3] = [1.0, 0.8, 0.4]
-    slope = StopModel.of(rig, base.outline()).prediction(theta, scan_of(), walls=True).wall_slope
+    slope = model_of(rig, base).prediction(theta, scan_of(), walls=True).wall_slope
     for k in range(len(base.walls)):
         by = step * (np.arange(len(base.walls)) == k)
         up, down = (
-            StopModel.of(rig, base.with_walls_moved(sign * by).outline()).prediction(theta, scan_of()).depth_m
-            for sign in (1, -1)
+            model_of(rig, base.with_walls_moved(sign * by)).prediction(theta, scan_of()).depth_m for sign in (1, -1)
         )
         # columns at a corner are left out: a displaced wall opens a gap there as wide as the step
         assert np.quantile(np.abs((up - down) / (2 * step) - slope[..., k]), 0.8) < 1e-6

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.live.tracker import Located, step_between
 from phasemark.matcher.locate import Locator, RigRecording, simulated_recording
-from phasemark.matcher.locate.locator import relative_pose
+from phasemark.matcher.locate.plane import relative_pose
 from phasemark.matcher.sequence import Estimate
 
 

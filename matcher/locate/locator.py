@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.matcher.estimate.acceptance import TOLERATED_SIGMA
 from phasemark.matcher.locate.kernel_arguments import Scan
+from phasemark.matcher.locate.plane import difference, relative_pose
 from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
@@ -151,7 +152,7 @@ class Locator:
             raise UsageError(f"'least_explained' must be in (0, 1), got {least_explained!r}")
         self.tolerance_m, self.tolerance_rad, self.least_explained = tolerance_m, tolerance_rad, least_explained
         self.wall_map, self.rig = wall_map, rig
-        self.model = StopModel.of(rig, wall_map.outline())
+        self.model = StopModel(rig, wall_map.outline(), rig.numbers())
         self._grid = pose_grid(self.model.outline)
 
     def locate(
@@ -309,7 +310,7 @@ class Locator:
             x, y, _ = fit.pose
             if not (low_x <= x <= high_x and low_y <= y <= high_y):
                 continue
-            if not any((apart(fit.pose, other.pose) < 0.2 * self._tolerance).all() for other in kept):
+            if not any((np.abs(difference(fit.pose, other.pose)) < 0.2 * self._tolerance).all() for other in kept):
                 kept.append(fit)
         return kept
 
@@ -359,8 +360,8 @@ class Locator:
         if not self.is_determined(std):
             return "undetermined"
         for other in (fits[k] for k in near[1:]):  # the truth may be on the far side of another pose
-            off = apart(other.pose, fits[0].pose) + TOLERATED_SIGMA * np.sqrt(np.diag(other.covariance)[:3])
-            if (off > self._tolerance).any():
+            off = np.abs(difference(other.pose, fits[0].pose))
+            if (off + TOLERATED_SIGMA * np.sqrt(np.diag(other.covariance)[:3]) > self._tolerance).any():
                 return "ambiguous"
         return ""
 
@@ -371,25 +372,10 @@ def _without(fit: StopFit, prior: tuple[_Float, _Float] | None) -> tuple[_Float,
     if prior is None:
         return fit.pose, information
     of_prior = np.linalg.inv(prior[1])
-    off = fit.pose - prior[0]
-    off[2] = math.remainder(off[2], math.tau)
+    off = difference(fit.pose, prior[0])
     root = np.sqrt(np.diag(information))
     values, axes = np.linalg.eigh((information - of_prior) / np.outer(root, root))
     values, axes = values[values > 1e-6], axes[:, values > 1e-6]  # the rest is the prior's alone
     along, across = axes / root[:, None], axes * root[:, None]
     own = across * values @ across.T
     return fit.pose + along / values @ along.T @ of_prior @ off, np.asarray(own, np.float64)
-
-
-def relative_pose(before: _Float, after: _Float) -> _Float:
-    """Return a pose in the frame of another one, (3,)."""
-    cos, sin = math.cos(before[2]), math.sin(before[2])
-    x, y = after[:2] - before[:2]
-    return np.array([cos * x + sin * y, cos * y - sin * x, math.remainder(after[2] - before[2], math.tau)])
-
-
-def apart(one: _Float, other: _Float) -> _Float:
-    """Return how far two poses are apart, (3,): m, m, rad."""
-    off = np.abs(one - other)
-    off[2] = abs(math.remainder(off[2], math.tau))
-    return off

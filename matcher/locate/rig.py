@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel, read_plan, sensor_in_folder, sensor_of
 from phasemark.matcher.locate.kernel_arguments import RigNumbers
+from phasemark.matcher.locate.plane import turn_of
 
 _Float = NDArray[np.float64]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -128,8 +129,7 @@ class OdometryDrift(PlanModel):
 
     def moved(self, mean: _Float, covariance: _Float, step: _Float) -> tuple[_Float, _Float]:
         """Return mean and covariance of a pose after a step in the body's frame."""
-        cos, sin = math.cos(mean[2]), math.sin(mean[2])
-        turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        turn = turn_of(mean[2])
         by = turn @ step
         slope = np.array([[1.0, 0.0, -by[1]], [0.0, 1.0, by[0]], [0.0, 0.0, 1.0]])
         return mean + by, slope @ covariance @ slope.T + turn @ self.covariance(step) @ turn.T

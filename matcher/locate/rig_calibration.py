@@ -10,12 +10,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.locate.kernel_arguments import RigNumbers, Scan
+from phasemark.matcher.locate.plane import difference, turn_of
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
 from phasemark.matcher.locate.scan_fit import StopModel, fit_stop
@@ -26,6 +28,34 @@ _Float = NDArray[np.float64]
 
 FREE = ("yaw", "position", "delay", "offset", "scale", "fov")
 """Parameters of a rig that are estimated by default; ``walls`` may be added."""
+
+
+class _Parameter(NamedTuple):
+    """A free number of each sensor, or of all: what it adds to, its prior, and how it is shown."""
+
+    part_of: str
+    number: str
+    """Field of :class:`RigNumbers`."""
+    std: str
+    """Field of :class:`~phasemark.matcher.locate.rig.SensorStd`, in `unit_of_std`."""
+    unit_of_std: float
+    column: int | None
+    """Of the slopes; None: the slope is 1."""
+    shown: tuple[float, str]
+    """Factor and unit."""
+    common: bool = False
+
+
+_PARAMETERS = {
+    "yaw": _Parameter("yaw", "yaw_rad", "yaw_deg", math.radians(1.0), SENSOR_YAW, (math.degrees(1.0), "°")),
+    "x": _Parameter("position", "x_m", "position_m", 1.0, SENSOR_X, (1e3, "mm")),
+    "y": _Parameter("position", "y_m", "position_m", 1.0, SENSOR_Y, (1e3, "mm")),
+    "delay": _Parameter("delay", "delay_s", "delay_s", 1.0, AGE, (1e3, "ms")),
+    "offset": _Parameter("offset", "offset_m", "range_offset_m", 1.0, None, (1e3, "mm")),
+    "scale": _Parameter("scale", "scale", "range_scale", 1.0, SCALE, (1.0, ""), common=True),
+    # sensors may have different fields of view: the part that is added to each
+    "fov": _Parameter("fov", "step_rad", "fov_deg", math.radians(1.0), STEP, (1.0, "of itself"), common=True),
+}
 _MARKER_STD = (0.005, 0.005, math.radians(3.0))
 """Of a marker frame in the body: x, y (m), yaw (rad)."""
 _TRUTH_STD = (0.002, 0.002, math.radians(0.15))
@@ -130,6 +160,11 @@ def calibrate_rig(
     return problem.result(first, last)
 
 
+def _unit(name: str, numbers: RigNumbers) -> _Float:
+    """Return the unit of a parameter for each sensor, rad, m or s: of the field of view the whole of it."""
+    return np.abs(numbers.step_rad) * numbers.columns if name == "fov" else np.ones(len(numbers.columns))
+
+
 class _Problem:
     """Stops, what they share, and the normal equations of that."""
 
@@ -149,172 +184,120 @@ class _Problem:
                 f"each recording must have a map and poses, got {len(recordings)} recordings, {len(wall_maps)} maps and"
                 f" {len(poses)} tables of poses"
             )
-        self.rig, self.recordings, self.free = rig, recordings, free
+        self.rig, self.start, self.recordings, self.truth = rig, rig.numbers(), recordings, poses
+        self.free = {name: one for name, one in _PARAMETERS.items() if one.part_of in free}
         self.maps = list({id(one): one for one in wall_maps}.values())
         self.of_map = [next(m for m, other in enumerate(self.maps) if other is one) for one in wall_maps]
         self.stops = [(r, k) for r, table in enumerate(poses) for k in range(len(table)) if np.isfinite(table[k]).all()]
         if len(self.stops) < _FEWEST_STOPS:
             raise UsageError(f"at least {_FEWEST_STOPS} stops must have a pose, got {len(self.stops)}")
-        self.truth = [poses[r][k] for r, k in self.stops]
-        self.theta: dict[int, _Float] = {}
-        self.doubt = [np.ones(3)] * len(self.stops)
+        self.theta: dict[tuple[int, int], _Float] = {}
+        self.doubt = {stop: np.ones(3) for stop in self.stops}
         self.groups = sorted({(r, int(recordings[r].robot[k])) for r, k in self.stops})
-        self._layout()
+        self._layout("walls" in free)
         self.value = np.zeros(len(self.std))
-        self.information, self.gradient = np.zeros((len(self.std),) * 2), np.zeros(len(self.std))
 
-    def _layout(self) -> None:
+    def _layout(self, walls: bool) -> None:
         """Lay out the parameters: of the rig, of the marker frames, of the walls; with prior standard deviations."""
-        own = [one.std for one in self.rig.sensor]
-        self.place: dict[str, slice] = {}
-        std: list[float] = []
-
-        def add(name: str, values: Sequence[float]) -> None:
-            self.place[name] = slice(len(std), len(std) + len(values))
-            std.extend(max(value, 1e-9) for value in values)
-
-        for name in self.free:
-            if name == "yaw":
-                add("yaw", [math.radians(one.yaw_deg) for one in own])
-            elif name == "position":
-                add("x", [one.position_m for one in own])
-                add("y", [one.position_m for one in own])
-            elif name == "delay":
-                add("delay", [one.delay_s for one in own])
-            elif name == "offset":
-                add("offset", [one.range_offset_m for one in own])
-            elif name == "scale":
-                add("scale", [own[0].range_scale])
-            elif name == "fov":  # relative: sensors may have different ones
-                add("fov", [own[0].fov_deg / (math.degrees(abs(self.start.step_rad[0])) * self.start.columns[0])])
-        for group in self.groups:
-            add(f"marker {group}", _MARKER_STD)
-        for m, one in enumerate(self.maps if "walls" in self.free else []):
-            outline = one.outline()
+        blocks: dict[object, Sequence[float] | _Float] = {}
+        for name, one in self.free.items():
+            std = one.unit_of_std * np.array([getattr(sensor.std, one.std) for sensor in self.rig.sensor])
+            std /= _unit(name, self.start)
+            blocks[name] = std[:1] if one.common else std
+        blocks |= dict.fromkeys(self.groups, _MARKER_STD)
+        for m, outline in enumerate([one.outline() for one in self.maps] if walls else []):
             if not (outline.std_m > 0).any():
                 raise UsageError("'std_m' of a map's walls must be positive where walls are free")
-            add(f"walls {m}", np.where(outline.std_m > 0, outline.std_m, 1e-9).tolist())
-        self.std = np.array(std)
-
-    @property
-    def start(self) -> RigNumbers:
-        """Numbers of the assumed rig."""
-        return self.rig.numbers()
-
-    def _of(self, name: str) -> _Float:
-        """Return the present values of a parameter, 0 where it is not free."""
-        return self.value[self.place[name]] if name in self.place else np.zeros(1)
+            blocks["walls", m] = outline.std_m
+        self.std = np.maximum(np.concatenate(list(blocks.values())), 1e-9)
+        ends = np.cumsum([len(std) for std in blocks.values()])
+        self.place = {key: slice(end - len(std), end) for (key, std), end in zip(blocks.items(), ends, strict=True)}
 
     @property
     def numbers(self) -> RigNumbers:
         """Present numbers of the rig."""
-        s = self.start
-        return RigNumbers(
-            s.yaw_rad + self._of("yaw"), s.x_m + self._of("x"), s.y_m + self._of("y"), s.delay_s + self._of("delay"),
-            s.offset_m + self._of("offset"), s.scale + self._of("scale"), s.step_rad * (1 + self._of("fov")),
-            s.columns, s.footprint,
-        )  # fmt: skip
+        moved = {}
+        for name, one in self.free.items():
+            before = getattr(self.start, one.number)
+            moved[one.number] = before + self.value[self.place[name]] * (before if name == "fov" else 1.0)
+        return self.start._replace(**moved)
 
     def round(self) -> float:
         """Fit every stop, gather the normal equations, and return the r.m.s. residual of what is explained."""
-        n = len(self.std)
         self.information, self.gradient = np.diag(self.std**-2.0), -self.value / self.std**2
         if "yaw" in self.place:
-            own = np.zeros(n)
+            own = np.zeros(len(self.std))
             own[self.place["yaw"]] = 1.0
             weight = _TIED / self.std[self.place["yaw"]].mean() ** 2
             self.information += weight * np.outer(own, own)
             self.gradient -= weight * own * (own @ self.value)
         models = []
         for m, one in enumerate(self.maps):
-            moved = self._of(f"walls {m}")[: len(one.walls)]
-            outline = (one.with_walls_moved(moved) if f"walls {m}" in self.place else one).outline()
-            models.append(StopModel.of(self.rig, outline, self.numbers))
-        squares, count, self.explained = 0.0, 0.0, 0.0
-        for i in range(len(self.stops)):
-            added = self._add(i, models[self.of_map[self.stops[i][0]]])
-            squares, count, self.explained = squares + added[0], count + added[1], self.explained + added[2]
-        self.explained /= len(self.stops)
+            if ("walls", m) in self.place:
+                one = one.with_walls_moved(self.value[self.place["walls", m]][: len(one.walls)])
+            models.append(StopModel(self.rig, one.outline(), self.numbers))
+        added = np.array([self._add(stop, models[self.of_map[stop[0]]]) for stop in self.stops])
+        squares, count, explained = added.sum(axis=0)
+        self.explained = explained / len(self.stops)
         return math.sqrt(squares / max(count, 1.0))
 
-    def _add(self, i: int, model: StopModel) -> tuple[float, float, float]:
+    def _add(self, stop: tuple[int, int], model: StopModel) -> tuple[float, float, float]:
         """Add one stop, its unknowns eliminated; return weighted squares, weights and the explained share."""
-        r, k = self.stops[i]
-        recording, truth = self.recordings[r], self.truth[i]
-        scan = recording.scan(k)
-        marker = f"marker {(r, int(recording.robot[k]))}"
-        cos, sin = math.cos(truth[2]), math.sin(truth[2])
-        turn = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])  # into the body's frame
-        std = np.sqrt(np.diag(self.maps[self.of_map[r]].part) + np.square(_TRUTH_STD))
-        precision = turn.T @ np.diag(self.doubt[i] / std**2) @ turn
-        mean = truth + turn.T @ self._of(marker)
-        fit = fit_stop(model, scan, self.theta.get(i, mean), (mean, precision),
-                       (1.0,) if i in self.theta else (8.0, 3.0, 1.0))  # fmt: skip
-        self.theta[i] = fit.theta
-        own, common, residual = self._linearised(model, scan, fit.theta, i)
-        left = fit.theta[:3] - mean
-        left[2] = math.remainder(left[2], math.tau)
-        left = turn @ left
+        r, k = stop
+        recording, truth, m = self.recordings[r], self.truth[r][k], self.of_map[r]
+        scan, marker = recording.scan(k), self.place[r, int(recording.robot[k])]
+        turn = turn_of(truth[2]).T  # into the body's frame
+        std = np.sqrt(np.diag(self.maps[m].part) + np.square(_TRUTH_STD))
+        weight = np.diag(self.doubt[stop] / std**2)
+        mean = truth + turn.T @ self.value[marker]
+        known = stop in self.theta
+        fit = fit_stop(model, scan, self.theta.get(stop, mean), (mean, turn.T @ weight @ turn),
+                       (1.0,) if known else (8.0, 3.0, 1.0))  # fmt: skip
+        self.theta[stop] = fit.theta
+        own, common, residual, total = self._linearised(model, scan, fit.theta, ("walls", m))
+        left = turn @ difference(fit.theta[:3], mean)
         n = len(fit.theta)
         own_information, pull = own.T @ own, own.T @ residual
         own_information[range(3, n), range(3, n)] += model.unknowns_std**-2.0
         pull[3:] -= fit.theta[3:] / model.unknowns_std**2
-        weight = np.diag(self.doubt[i] / std**2)
         by_pose = np.zeros((3, n))
         by_pose[:, :3] = turn
         own_information += by_pose.T @ weight @ by_pose
         pull -= by_pose.T @ weight @ left
         cross, information, gradient = common.T @ own, common.T @ common, common.T @ residual
-        place = self.place[marker]
-        cross[place] -= weight @ by_pose
-        information[place, place] += weight
-        gradient[place] += weight @ left
+        cross[marker] -= weight @ by_pose
+        information[marker, marker] += weight
+        gradient[marker] += weight @ left
         solved = np.linalg.solve(own_information, np.column_stack([cross.T, pull]))
         self.information += information - cross @ solved[:, :-1]
         self.gradient += gradient - cross @ solved[:, -1]
-        worst = float((np.abs(left[:2]) / std[:2]).max())
-        off = np.array([worst, worst, abs(left[2]) / std[2]])
-        self.doubt[i] = 1 / (1 + (off / _DOUBTFUL) ** 2)
-        return float(residual @ residual), float(self.weight_sum), fit.share
+        off = np.abs(left) / std
+        off[:2] = off[:2].max()
+        self.doubt[stop] = 1 / (1 + (off / _DOUBTFUL) ** 2)
+        return float(residual @ residual), total, fit.share
 
-    def _linearised(self, model: StopModel, scan: Scan, theta: _Float, i: int) -> tuple[_Float, _Float, _Float]:
-        """Return slopes by the stop's unknowns and by common parameters, and residuals; whitened and weighted."""
-        m = self.of_map[self.stops[i][0]]
-        seen = model.prediction(theta, scan, walls=f"walls {m}" in self.place)
-        sigma, sensors = model.sigma_m(seen), len(self.rig.sensor)
+    def _linearised(
+        self, model: StopModel, scan: Scan, theta: _Float, walls: tuple[str, int]
+    ) -> tuple[_Float, _Float, _Float, float]:
+        """Return slopes by the stop's unknowns and by common parameters, residuals, all whitened, and the weight."""
+        seen, sensors = model.prediction(theta, scan, walls=walls in self.place), len(self.rig.sensor)
         used = np.isfinite(scan.depth_m) & np.isfinite(seen.depth_m)
-        r = (scan.depth_m - seen.depth_m)[used] / sigma[used]
-        kappa = model.outlier_density * sigma[used] * math.sqrt(2 * math.pi)
-        likely = np.exp(-0.5 * np.minimum(r**2, 1400.0))
-        weight = likely / (likely + kappa)
-        self.weight_sum = weight.sum()
-        scale = np.sqrt(weight) / sigma[used]
+        sigma = model.sigma_m(seen)[used]
+        r = (scan.depth_m - seen.depth_m)[used] / sigma
+        weight = model.explained(r, sigma)
         slope, of = seen.slope[used], np.nonzero(used)[1]
-        own = np.zeros((len(r), len(theta)))
-        common = np.zeros((len(r), len(self.std)))
-        row = np.arange(len(r))
+        own, common, row = np.zeros((len(r), len(theta))), np.zeros((len(r), len(self.std))), np.arange(len(r))
         own[:, :N_BODY] = slope[:, :N_BODY]
         own[row, N_BODY + of] = 1.0
         own[row, N_BODY + sensors + of] = slope[:, SENSOR_YAW]
-        columns = {
-            "yaw": SENSOR_YAW,
-            "x": SENSOR_X,
-            "y": SENSOR_Y,
-            "delay": AGE,
-            "offset": None,
-            "scale": SCALE,
-            "fov": STEP,
-        }
-        for name, column in columns.items():
-            if name not in self.place:
-                continue
-            first = self.place[name].start
-            at = first + (of if name not in ("scale", "fov") else 0 * of)
-            values = np.ones(len(r)) if column is None else slope[:, column]
+        for name, one in self.free.items():
+            values = np.ones(len(r)) if one.column is None else slope[:, one.column]
+            at = self.place[name].start + (0 if one.common else of)
             common[row, at] = values * model.numbers.step_rad[of] if name == "fov" else values
-        if f"walls {m}" in self.place:
-            common[:, self.place[f"walls {m}"]] = seen.wall_slope[used]
-        return own * scale[:, None], common * scale[:, None], r * np.sqrt(weight)
+        if walls in self.place:
+            common[:, self.place[walls]] = seen.wall_slope[used]
+        scale = (np.sqrt(weight) / sigma)[:, None]
+        return own * scale, common * scale, r * np.sqrt(weight), float(weight.sum())
 
     def step(self) -> float:
         """Move the common parameters, and return the largest move in prior standard deviations."""
@@ -327,31 +310,22 @@ class _Problem:
         scaled = np.linalg.inv(self.information * np.outer(self.std, self.std))
         frames = np.mean([np.isfinite(self.recordings[r].depth_m[k]).any(axis=(1, 2)).sum() for r, k in self.stops])
         std = np.minimum(self.std * np.sqrt(np.diag(scaled) * max(1.0, float(frames) / 3)), self.std)
-        numbers, doubts, of_rig = [], [], {}
-        units = {"yaw": (math.degrees(1.0), "°"), "x": (1e3, "mm"), "y": (1e3, "mm"), "delay": (1e3, "ms"),
-                 "offset": (1e3, "mm"), "scale": (1.0, ""), "fov": (1.0, "of itself")}  # fmt: skip
-        for name, (by, unit) in units.items():
-            for j in range(*self.place[name].indices(len(std))) if name in self.place else ():
-                k = j - self.place[name].start
-                sensor = "" if name in ("scale", "fov") else self.rig.names[k]
-                numbers.append((name, sensor, by * float(self.value[j]), by * float(std[j]), unit))
-                if abs(self.value[j]) > _FAR * self.std[j]:
-                    doubts.append(f"{name} of {sensor or 'all'} moved by {abs(self.value[j]) / self.std[j]:.1f} prior"
-                                  " standard deviations")  # fmt: skip
+        numbers, doubts, of_rig = [], [], dict[str, _Float]()
+        for name, one in self.free.items():
+            by, unit = one.shown
+            place = self.place[name]
+            for j, value in enumerate(self.value[place]):
+                sensor = "" if one.common else self.rig.names[j]
+                numbers.append((name, sensor, by * float(value), by * float(std[place][j]), unit))
+                if (off := abs(value) / self.std[place][j]) > _FAR:
+                    doubts.append(f"{name} of {sensor or 'all'} moved by {off:.1f} prior standard deviations")
+            own = std[place] * _unit(name, self.numbers) / one.unit_of_std
+            of_rig[one.std] = np.maximum(own, of_rig.get(one.std, 0.0))
         if self.explained < 0.7:
             doubts.append(f"{100 * self.explained:.0f} % of the columns are explained, 70 % are needed")
         if last > first:
             doubts.append(f"residuals grew from {first:.2f} to {last:.2f} standard deviations")
-        sensors = np.ones(len(self.rig.sensor))
-        for name, key, by in (("yaw", "yaw_deg", math.degrees(1.0)), ("delay", "delay_s", 1.0),
-                              ("offset", "range_offset_m", 1.0), ("scale", "range_scale", 1.0)):  # fmt: skip
-            if name in self.place:
-                of_rig[key] = by * std[self.place[name]] * sensors
-        if "x" in self.place:
-            of_rig["position_m"] = np.maximum(std[self.place["x"]], std[self.place["y"]])
-        if "fov" in self.place:
-            of_rig["fov_deg"] = np.degrees(np.abs(self.numbers.step_rad)) * self.start.columns * std[self.place["fov"]]
-        markers = tuple((self.recordings[r].run, robot, self._of(f"marker {(r, robot)}")) for r, robot in self.groups)
-        walls = tuple(self._of(f"walls {m}") for m in range(len(self.maps))) if "walls" in self.free else ()
-        return RigCalibration(self.rig.with_numbers(self.numbers, of_rig), tuple(numbers), markers, walls,
+        markers = tuple((self.recordings[r].run, robot, self.value[self.place[r, robot]]) for r, robot in self.groups)
+        walls = [self.value[self.place["walls", m]] for m in range(len(self.maps)) if ("walls", m) in self.place]
+        return RigCalibration(self.rig.with_numbers(self.numbers, of_rig), tuple(numbers), markers, tuple(walls),
                               (first, last), len(self.stops), tuple(doubts))  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.estimate.solver import descend
 from phasemark.matcher.locate.kernel_arguments import Outline, Prediction, RigNumbers, Scan
+from phasemark.matcher.locate.plane import difference
 from phasemark.matcher.locate.rig import Rig
 from phasemark.matcher.locate.scan_rows import N_BODY, SENSOR_YAW, empty_prediction, predict, sums
 
@@ -33,18 +34,12 @@ class StopModel:
     ----------
     rig : Rig
     outline : Outline
-    numbers : RigNumbers, optional
-        Those of the rig if left out.
+    numbers : RigNumbers
     """
 
     rig: Rig
     outline: Outline
     numbers: RigNumbers
-
-    @classmethod
-    def of(cls, rig: Rig, outline: Outline, numbers: RigNumbers | None = None) -> StopModel:
-        """Take a rig, with its own numbers if no others are given."""
-        return cls(rig, outline, rig.numbers() if numbers is None else numbers)
 
     @property
     def longest(self) -> _Float:
@@ -76,6 +71,11 @@ class StopModel:
         noise = self.rig.noise
         depth = np.where(np.isnan(seen.depth_m), noise.max_range_m, seen.depth_m)
         return np.hypot(noise.floor_m + noise.share * depth, noise.edge_share * seen.spread_m)
+
+    def explained(self, residual: _Float, sigma_m: _Float) -> _Float:
+        """Return the probability that columns are explained, by their residuals in standard deviations."""
+        likely = np.exp(-0.5 * np.minimum(residual**2, 1400.0))
+        return np.asarray(likely / (likely + self.outlier_density * sigma_m * math.sqrt(2 * math.pi)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,47 +110,35 @@ class StopFit:
         return self.explained / max(self.observed, 1)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class _Point:
-    """A place of a descent, with the noise of the round."""
+    """A place of a descent, with the noise of the round: that of the place itself times `width` where none is given."""
 
     model: StopModel
     scan: Scan
     theta: _Float
-    mean: _Float
-    precision: _Float
-    sigma_m: _Float
-    cost: float
-    information: _Float
-    gradient: _Float
-    explained: int
+    prior: tuple[_Float, _Float]
+    sigma_m: _Float | None = None
+    width: float = 1.0
 
-    @classmethod
-    def at(
-        cls,
-        model: StopModel,
-        scan: Scan,
-        theta: _Float,
-        prior: tuple[_Float, _Float],
-        sigma_m: _Float | None,
-        width: float,
-    ) -> _Point:
-        """Evaluate a place; without a noise with that of the place times `width`."""
-        seen = model.prediction(theta, scan)
-        sigma = width * model.sigma_m(seen) if sigma_m is None else sigma_m
-        information, gradient = np.empty((len(theta), len(theta))), np.empty(len(theta))
-        cost, explained = sums(scan, seen, sigma, model.outlier_density, information, gradient)
-        mean, precision = prior
-        off = theta - mean
-        off[2] = math.remainder(off[2], math.tau)
+    def __post_init__(self) -> None:
+        seen = self.model.prediction(self.theta, self.scan)
+        if self.sigma_m is None:
+            self.sigma_m = self.width * self.model.sigma_m(seen)
+        n, (mean, precision) = len(self.theta), self.prior
+        self.information, self.gradient = np.empty((n, n)), np.empty(n)
+        cost, self.explained = sums(
+            self.scan, seen, self.sigma_m, self.model.outlier_density, self.information, self.gradient
+        )
+        off = difference(self.theta, mean)
         pull = precision @ off
-        return cls(model, scan, theta, mean, precision, sigma, cost + float(off @ pull), information + precision,
-                   gradient - pull, explained)  # fmt: skip
+        self.cost = cost + float(off @ pull)
+        self.information += precision
+        self.gradient -= pull
 
     def moved(self, step: _Float) -> Self:
         """Return the place a step away, with the same noise."""
-        prior = (self.mean, self.precision)
-        return type(self).at(self.model, self.scan, self.theta + step, prior, self.sigma_m, 1.0)  # type: ignore[return-value]
+        return replace(self, theta=self.theta + step)
 
 
 def fit_stop(
@@ -186,13 +174,13 @@ def fit_stop(
     longest = model.longest
     for k in range(_MOST_ROUNDS):
         width = widths[min(k, len(widths) - 1)]
-        point = _Point.at(model, scan, theta, (mean, precision), None, width)
+        point = _Point(model, scan, theta, (mean, precision), width=width)
         point, _, _ = descend(point, longest, most=_MOST_STEPS, done=_DONE, shares=(1.0, 0.5, 0.2))
         moved = point.theta - theta
         theta = point.theta
         if k + 1 >= len(widths) and float(moved @ point.information @ moved) < 10 * _DONE:
             break
-    return _as_fit(_Point.at(model, scan, theta, (mean, precision), None, widths[-1]), bool(prior))
+    return _as_fit(_Point(model, scan, theta, (mean, precision), width=widths[-1]), bool(prior))
 
 
 def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
@@ -202,9 +190,7 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
     """
     seen, sensors = model.prediction(fit.theta, scan), scan.depth_m.shape[1]
     sigma = model.sigma_m(seen)
-    with np.errstate(over="ignore"):
-        likely = np.exp(-0.5 * ((scan.depth_m - seen.depth_m) / sigma) ** 2)
-    scale = np.sqrt(likely / (likely + model.outlier_density * sigma * math.sqrt(2 * math.pi))) / sigma
+    scale = np.sqrt(model.explained((scan.depth_m - seen.depth_m) / sigma, sigma)) / sigma
     information = np.linalg.inv(fit.covariance)
     reduced = []
     for s, c in np.ndindex(scan.depth_m.shape[1:]):
@@ -223,6 +209,7 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
 def _as_fit(point: _Point, with_prior: bool) -> StopFit:
     """Return the fit at a place; its cost counts the width of the noise there, which differs from place to place."""
     observed = np.isfinite(point.scan.depth_m)
+    assert point.sigma_m is not None
     width = point.sigma_m[observed]
     kappa = point.model.outlier_density * width * math.sqrt(2 * math.pi)
     cost = point.cost + 2 * float(np.log(width / (1 + kappa)).sum())

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark.matcher.locate.kernel_arguments import Scan
-from phasemark.matcher.locate.locator import relative_pose
+from phasemark.matcher.locate.plane import relative_pose
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import OdometryDrift, Rig
 from phasemark.matcher.locate.scan_fit import StopModel
@@ -47,7 +47,7 @@ def simulated_recording(
     """
     truth, times = np.asarray(poses, np.float64), np.asarray(time_s, np.float64)
     track = np.zeros((len(times), 3)) if moved is None else np.asarray(moved, np.float64)
-    model, noise = StopModel.of(rig, wall_map.outline()), rig.noise
+    model, noise = StopModel(rig, wall_map.outline(), rig.numbers()), rig.noise
     std, columns = model.unknowns_std, model.numbers.columns
     shape = (len(times), len(columns), int(columns.max()))
     depth = np.empty((len(truth), *shape))

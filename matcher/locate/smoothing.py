@@ -9,11 +9,11 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 from scipy.stats import chi2
 
 from phasemark import UsageError
-from phasemark.matcher.locate.locator import LocatedPose, Locator, relative_pose
+from phasemark.matcher.locate.locator import LocatedPose, Locator
+from phasemark.matcher.locate.plane import difference, relative_pose, stepped, turn_of
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import OdometryDrift
 
@@ -22,8 +22,6 @@ _Float = NDArray[np.float64]
 _FALSE_ALARM = 1e-4
 """Probability with which an accepted pose that is right is left out for disagreeing with the others."""
 _MOST_STEPS = 10
-_BAND = 5
-"""Beside the diagonal, of pairs of neighbouring poses with three numbers each."""
 
 
 def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: Locator) -> list[LocatedPose]:
@@ -107,8 +105,7 @@ class _Chain:
             poses, covariance = self._fitted(used)
             distance = np.full(len(used), -np.inf)
             for k in np.flatnonzero(used):
-                off = self.measured[k] - poses[k]
-                off[2] = math.remainder(off[2], math.tau)
+                off = difference(self.measured[k], poses[k])
                 # the covariance of a residual is that of the measurement less that of the fit: Λ⁻¹ − C
                 pulled = self.weight[k] @ off
                 spread = self.weight[k] - self.weight[k] @ covariance[k] @ self.weight[k]
@@ -127,55 +124,36 @@ class _Chain:
             for k in range(n):
                 own = slice(3 * k, 3 * k + 3)
                 if used[k]:
-                    off = self.measured[k] - poses[k]
-                    off[2] = math.remainder(off[2], math.tau)
                     normal[own, own] += self.weight[k]
-                    pull[own] += self.weight[k] @ off
+                    pull[own] += self.weight[k] @ difference(self.measured[k], poses[k])
                 if k + 1 < n:
-                    self._join(poses, k, normal, pull)
-            banded = np.zeros((_BAND + 1, 3 * n))
-            for below in range(min(_BAND + 1, 3 * n)):
-                banded[below, : 3 * n - below] = np.diagonal(normal, -below)
-            step = solveh_banded(banded, np.column_stack([pull, np.eye(3 * n)]), lower=True)
-            poses = poses + step[:, 0].reshape(n, 3)
-            if np.abs(step[:, 0]).max() < 1e-9:
+                    both, slope = slice(3 * k, 3 * k + 6), _step_slope(poses[k], poses[k + 1])
+                    weighted = slope.T @ self.precision[k]
+                    normal[both, both] += weighted @ slope
+                    pull[both] += weighted @ difference(self.steps[k], relative_pose(poses[k], poses[k + 1]))
+            covariance: _Float = np.asarray(np.linalg.inv(normal), np.float64)
+            step = (covariance @ pull).reshape(n, 3)
+            poses = poses + step
+            if np.abs(step).max() < 1e-9:
                 break
-        covariance = step[:, 1:].reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
-        return poses, covariance
-
-    def _join(self, poses: _Float, k: int, normal: _Float, pull: _Float) -> None:
-        """Add the step between two stops to the normal equations."""
-        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
-        by = poses[k + 1, :2] - poses[k, :2]
-        seen = relative_pose(poses[k], poses[k + 1])
-        slope = np.zeros((3, 6))
-        slope[:, 3:] = [[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]
-        slope[:, :3] = -slope[:, 3:]
-        slope[:2, 2] = [cos * by[1] - sin * by[0], -cos * by[0] - sin * by[1]]
-        off = self.steps[k] - seen
-        off[2] = math.remainder(off[2], math.tau)
-        both = slice(3 * k, 3 * k + 6)
-        normal[both, both] += slope.T @ self.precision[k] @ slope
-        pull[both] += slope.T @ self.precision[k] @ off
+        return poses, covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
 
     def _started(self, used: NDArray[np.bool_]) -> _Float:
         """Return poses to begin with: those that were measured, and from the nearest of them along the odometry."""
-        n = len(used)
-        poses = self.measured.copy()
-        known = used.copy()
+        poses, known, n = self.measured.copy(), used.copy(), len(used)
         for k in [*range(1, n), *range(n - 2, -1, -1)]:
-            for other in (k - 1, k + 1):
-                if known[k] or not (0 <= other < n and known[other]):
-                    continue
-                cos, sin = math.cos(poses[other, 2]), math.sin(poses[other, 2])
-                if other < k:
-                    step = self.steps[other]
-                    turned = np.array([cos * step[0] - sin * step[1], sin * step[0] + cos * step[1], step[2]])
-                    poses[k] = poses[other] + turned
-                else:
-                    heading = poses[other, 2] - self.steps[k, 2]
-                    cos, sin = math.cos(heading), math.sin(heading)
-                    x, y = self.steps[k, :2]
-                    poses[k] = [poses[other, 0] - cos * x + sin * y, poses[other, 1] - sin * x - cos * y, heading]
-                known[k] = True
+            if not known[k] and k and known[k - 1]:
+                poses[k], known[k] = stepped(poses[k - 1], self.steps[k - 1]), True
+            elif not known[k] and k + 1 < n and known[k + 1]:
+                back = relative_pose(self.steps[k], np.zeros(3))
+                poses[k], known[k] = stepped(poses[k + 1], back), True
         return poses
+
+
+def _step_slope(before: _Float, after: _Float) -> _Float:
+    """Return the slopes of the step between two poses by both, (3, 6)."""
+    turn = turn_of(before[2]).T
+    x, y, _ = turn @ (after - before)
+    slope = np.hstack([-turn, turn])
+    slope[:2, 2] = y, -x
+    return slope
