@@ -34,7 +34,7 @@ from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.live import Live, Tracker, open_sink, open_source
 from phasemark.matcher.live.map_tracker import MapTracker
 from phasemark.matcher.live.rig_frames import open_rig_source
-from phasemark.matcher.live.search_beside import SearchesAsLogged, SearchesInLine
+from phasemark.matcher.live.search_beside import SearchesInLine
 from phasemark.matcher.live.sources import SourceFault
 from phasemark.matcher.live.tracker import Located
 from phasemark.matcher.locate import Locator, read_rig_recording, recording_bytes, simulated_recording
@@ -289,7 +289,7 @@ def test_a_log_in_mcap_replays_the_same_poses_bit_for_bit(bank, printed, tmp_pat
 
     first = poses(open_source(str(path), sensor, in_time=False), None, [open_sink(f"mcap:{log}", sensor)])
     again: Any = open_source(str(log), sensor, in_time=False)
-    second = poses(again, SearchesAsLogged(Matcher(bank, "refine", workers=1), again.searches()))
+    second = poses(again, SearchesInLine(Matcher(bank, "refine", workers=1), logged=again.searches()))
     assert len(first) == len(second) == 22
     for one, other in zip(first, second, strict=True):
         assert one[:2] == other[:2]

@@ -181,7 +181,7 @@ def _bank(name: Path, mesh: Landmark, sensor: str | None, distance: str) -> Bank
 def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Tracker:
     """Return the tracker of a landmark; searches run beside it, but in line for a recording."""
     from phasemark.matcher.live.mcap_log import McapSource
-    from phasemark.matcher.live.search_beside import SearchesAsLogged, SearchesBeside, SearchesInLine
+    from phasemark.matcher.live.search_beside import SearchesBeside, SearchesInLine
     from phasemark.matcher.live.tracker import Tracker
     from phasemark.matcher.sequence import FreeMotion, PoseEstimator, Standing
 
@@ -196,11 +196,10 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
     turn = math.radians(motion.turn_rate)
     free = FreeMotion(motion.speed / 2, motion.speed, turn / 2, turn)
     estimator = PoseEstimator(Standing(flat=motion.flat), free, jitter_s=bank.sensor.systematic_time_s)
-    every = 30  # frames of a recording between two searches
-    beside = source.is_live and not matcher.is_quick
-    searches: Any = SearchesBeside(matcher) if beside else SearchesInLine(matcher, every)
-    if isinstance(source, McapSource):
-        searches = SearchesAsLogged(matcher, source.searches())
+    if source.is_live and not matcher.is_quick:
+        searches: Any = SearchesBeside(matcher)
+    else:
+        searches = SearchesInLine(matcher, logged=source.searches() if isinstance(source, McapSource) else None)
     return Tracker(
         matcher, estimator, searches, delay_s=None if motion.delay_ms is None else motion.delay_ms / 1e3
     )  # fmt: skip

@@ -1,104 +1,36 @@
 """Messages of ROS 2 as DDS types: final, in plain CDR, by the names and with the type hashes of ROS 2."""
 
-# Annotations are evaluated: cyclonedds reads the types of fields. Importing this module needs cyclonedds.
+# Importing this module needs cyclonedds.
 # mypy: ignore-errors
 # because its types are made as the module is imported
 
-from dataclasses import dataclass
 from typing import Any
 
 from phasemark.matcher.live.extras import needed
 
-idl = needed("cyclonedds.idl", "the sink 'ros'", "dds")
+_idl = needed("cyclonedds.idl", "the sink 'ros'", "dds")
 _types, _annotations = needed("cyclonedds.idl.types", "", "dds"), needed("cyclonedds.idl.annotations", "", "dds")
 
 
-def _field(name: str) -> Any:
-    return getattr(_types, name)
+def _message(package: str, name: str, **fields: Any) -> Any:
+    """Return the type of a message with its fields in order."""
+    kind = _idl.make_idl_struct(name, f"{package}::msg::dds_::{name}_", fields)
+    return _annotations.final(kind)
 
 
-@dataclass
-@_annotations.final
-class Time(idl.IdlStruct, typename="builtin_interfaces::msg::dds_::Time_"):
-    """Time stamp."""
-
-    sec: _field("int32")
-    nanosec: _field("uint32")
-
-
-@dataclass
-@_annotations.final
-class Header(idl.IdlStruct, typename="std_msgs::msg::dds_::Header_"):
-    """Stamp and frame."""
-
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-@_annotations.final
-class Point(idl.IdlStruct, typename="geometry_msgs::msg::dds_::Point_"):
-    """Position, metres."""
-
-    x: _field("float64")
-    y: _field("float64")
-    z: _field("float64")
-
-
-@dataclass
-@_annotations.final
-class Quaternion(idl.IdlStruct, typename="geometry_msgs::msg::dds_::Quaternion_"):
-    """Orientation."""
-
-    x: _field("float64")
-    y: _field("float64")
-    z: _field("float64")
-    w: _field("float64")
-
-
-@dataclass
-@_annotations.final
-class Pose(idl.IdlStruct, typename="geometry_msgs::msg::dds_::Pose_"):
-    """Position and orientation."""
-
-    position: Point
-    orientation: Quaternion
-
-
-@dataclass
-@_annotations.final
-class PoseWithCovariance(idl.IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovariance_"):
-    """Pose with its covariance, row by row: x, y, z, about x, about y, about z."""
-
-    pose: Pose
-    covariance: _types.array[_field("float64"), 36]
-
-
-@dataclass
-@_annotations.final
-class PoseWithCovarianceStamped(idl.IdlStruct, typename="geometry_msgs::msg::dds_::PoseWithCovarianceStamped_"):
-    """Pose with its covariance, stamp and frame."""
-
-    header: Header
-    pose: PoseWithCovariance
-
-
-@dataclass
-@_annotations.final
-class PoseStamped(idl.IdlStruct, typename="geometry_msgs::msg::dds_::PoseStamped_"):
-    """Pose with stamp and frame."""
-
-    header: Header
-    pose: Pose
-
-
-@dataclass
-@_annotations.final
-class String(idl.IdlStruct, typename="std_msgs::msg::dds_::String_"):
-    """Text."""
-
-    data: str
-
+_GEOMETRY, _double = "geometry_msgs", _types.float64
+Time = _message("builtin_interfaces", "Time", sec=_types.int32, nanosec=_types.uint32)
+Header = _message("std_msgs", "Header", stamp=Time, frame_id=str)
+Point = _message(_GEOMETRY, "Point", x=_double, y=_double, z=_double)
+Quaternion = _message(_GEOMETRY, "Quaternion", x=_double, y=_double, z=_double, w=_double)
+Pose = _message(_GEOMETRY, "Pose", position=Point, orientation=Quaternion)
+# the covariance row by row: x, y, z, about x, about y, about z
+PoseWithCovariance = _message(_GEOMETRY, "PoseWithCovariance", pose=Pose, covariance=_types.array[_double, 36])
+PoseWithCovarianceStamped = _message(
+    "geometry_msgs", "PoseWithCovarianceStamped", header=Header, pose=PoseWithCovariance
+)
+PoseStamped = _message(_GEOMETRY, "PoseStamped", header=Header, pose=Pose)
+String = _message("std_msgs", "String", data=str)
 
 TYPE_HASHES = {
     PoseWithCovarianceStamped: "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",

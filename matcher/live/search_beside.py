@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any, BinaryIO, Protocol
 
@@ -42,50 +43,33 @@ class Searches(Protocol):
 
 
 class SearchesInLine:
-    """Searches every n-th frame at once: the answers depend on the frames alone."""
-
-    def __init__(self, matcher: Matcher, every: int) -> None:
-        self._matcher, self._every = matcher, every
-        self._found: Searched | None = None
-
-    def offer(self, frame: int, filtered: FilteredFrames, *, urgent: bool) -> None:
-        """Search the frame if its turn has come, or if that is urgent."""
-        if urgent or frame % self._every == self._every - 1:
-            self._found = Searched(frame, self._matcher.match(filtered)[0])
-
-    def answer(self, frame: int) -> Searched | None:
-        """Return the answer, once."""
-        found, self._found = self._found, None
-        return found
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-
-class SearchesAsLogged:
-    """Searches the frames that a log has as searched, and uses each answer where it was used then.
+    """Searches every n-th frame at once, or the frames that a log has as searched: answers depend on frames alone.
 
     Parameters
     ----------
     matcher : Matcher
-    used_with : mapping of int to int
-        Frame that was searched, by the frame with which the answer was used.
+    every : int
+    logged : mapping of int to int, optional
+        Frame that was searched, by the frame with which the answer was used: that is repeated.
     """
 
-    def __init__(self, matcher: Matcher, used_with: Mapping[int, int]) -> None:
-        self._matcher, self._used_with = matcher, used_with
-        self._wanted = set(used_with.values())
+    def __init__(self, matcher: Matcher, every: int = 30, logged: Mapping[int, int] | None = None) -> None:
+        self._matcher, self._every, self._logged = matcher, every, logged
+        self._wanted = None if logged is None else set(logged.values())
         self._found: dict[int, Match] = {}
 
     def offer(self, frame: int, filtered: FilteredFrames, *, urgent: bool) -> None:
-        """Search the frame if it was searched then."""
-        if frame in self._wanted:
+        """Search the frame if its turn has come or that is urgent, or if it was searched then."""
+        is_due = urgent or frame % self._every == self._every - 1
+        if is_due if self._wanted is None else frame in self._wanted:
             self._found[frame] = self._matcher.match(filtered)[0]
 
     def answer(self, frame: int) -> Searched | None:
-        """Return the answer that was used with this frame."""
-        searched = self._used_with.get(frame)
-        return None if searched is None else Searched(searched, self._found.pop(searched))
+        """Return the answer that is to be used with this frame, once."""
+        searched = frame if self._logged is None else self._logged.get(frame)
+        if searched is None or searched not in self._found:
+            return None
+        return Searched(searched, self._found.pop(searched))
 
     def close(self) -> None:
         """Nothing is open."""
@@ -101,41 +85,35 @@ class SearchesBeside:
             [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment,
             start_new_session=True,
         )  # fmt: skip
+        self._matcher, self._found = matcher, list[Searched]()
+        self._ask(_portable(matcher))
+        self._is_ready = False
+
+    def _ask(self, thing: Any) -> None:
+        """Let the process answer, in a thread that waits for it: a Searched, None, or why it has ended."""
+        self._running: Future[Searched | None] = Future()
+        threading.Thread(target=self._wait, args=(thing, self._running), daemon=True).start()
+
+    def _wait(self, thing: Any, running: Future[Searched | None]) -> None:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
-        self._to, self._from = self._process.stdin, self._process.stdout
-        self._found: list[Searched] = []
-        self._matcher = matcher
-        self._is_busy, self._is_ready = True, threading.Event()
-        self._send(_portable(matcher))
-        self._reader = threading.Thread(target=self._read, daemon=True)
-        self._reader.start()
-
-    def _send(self, thing: Any) -> None:
         try:
-            pickle.dump(thing, self._to, pickle.HIGHEST_PROTOCOL)
-            self._to.flush()
-        except OSError:  # the process has ended: tracking goes on without it
-            self._is_busy = True
-
-    def _read(self) -> None:
-        while True:
-            try:
-                found = pickle.load(self._from)
-            except (EOFError, OSError, ValueError, pickle.UnpicklingError):
-                return
-            if isinstance(found, Searched):
-                self._found.append(found)
-            self._is_busy = False
-            self._is_ready.set()
+            pickle.dump(thing, self._process.stdin, pickle.HIGHEST_PROTOCOL)
+            self._process.stdin.flush()
+            running.set_result(pickle.load(self._process.stdout))
+        except Exception as error:  # whatever an end of the process makes pipes and pickle say
+            running.set_exception(error)
 
     def offer(self, frame: int, filtered: FilteredFrames, *, urgent: bool) -> None:
         """Search the frame unless a search runs; until the process is there, urgent ones here and now."""
-        if urgent and not self._is_ready.is_set():
-            self._found.append(Searched(frame, self._matcher.match(filtered)[0]))
-        elif not self._is_busy:
-            self._is_busy = True
-            self._send((frame, filtered))
+        if not self._running.done():
+            if urgent and not self._is_ready:
+                self._found.append(Searched(frame, self._matcher.match(filtered)[0]))
+        elif self._running.exception() is None:  # else the process has ended: tracking goes on without it
+            self._is_ready = True
+            if (found := self._running.result()) is not None:
+                self._found.append(found)
+            self._ask((frame, filtered))
 
     def answer(self, frame: int) -> Searched | None:
         """Return an answer that has come, once."""
@@ -144,10 +122,8 @@ class SearchesBeside:
     def close(self) -> None:
         """End the process."""
         self._process.kill()
-        self._process.wait()
-        self._reader.join(1.0)
-        self._to.close()
-        self._from.close()
+        self._running.exception(1.0)
+        self._process.communicate()
 
 
 def _portable(matcher: Matcher) -> Any:

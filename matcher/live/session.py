@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -65,41 +67,6 @@ class Update:
         return np.asarray(own.range_m[0, 0] if isinstance(own, Frames) else own.depth_m[0, -1])
 
 
-class _Newest:
-    """The newest frame; what nobody took in time is counted. Of a recording every frame is kept until it is taken."""
-
-    def __init__(self, keeps_all: bool) -> None:
-        self._changed, self._keeps_all = threading.Condition(), keeps_all
-        self._held: Arrival | None = None
-        self.n_dropped = 0
-        self.is_over = False
-        self.error: Exception | None = None
-
-    def put(self, arrival: Arrival) -> None:
-        """Put a frame in the place of the one before."""
-        with self._changed:
-            while self._keeps_all and self._held is not None and not self.is_over:
-                self._changed.wait()
-            self.n_dropped += self._held is not None
-            self._held = arrival
-            self._changed.notify_all()
-
-    def take(self, timeout_s: float) -> Arrival | None:
-        """Return a frame that is new, None if none comes in time."""
-        with self._changed:
-            if self._held is None and not self.is_over:
-                self._changed.wait(timeout_s)
-            found, self._held = self._held, None
-            self._changed.notify_all()
-            return found
-
-    def end(self, error: Exception | None = None) -> None:
-        """Say that no frame follows."""
-        with self._changed:
-            self.is_over, self.error = True, error
-            self._changed.notify_all()
-
-
 class Live:
     """Locates the frames of a source as they come, and publishes accepted poses.
 
@@ -130,7 +97,8 @@ class Live:
         self._delay_s, self._say = delay_s, say or (lambda line: None)
         self._said = ""
         self._stop = threading.Event()
-        self._newest = _Newest(keeps_all=not source.is_live)
+        self._newest: queue.Queue[Arrival] = queue.Queue(1)
+        self._is_over, self._error = threading.Event(), list[Exception]()
         self._number = -1
         self._offset_s: float | None = None
         self._held = 0
@@ -160,28 +128,27 @@ class Live:
         next_status = time.monotonic()
         try:
             while not self._stop.is_set():
-                arrival = self._newest.take(0.05)
-                if arrival is not None:
-                    update = self._located(arrival)
+                try:
+                    update = self._located(self._newest.get(timeout=0.05))
                     self._publish(update)
                     if on_update is not None:
                         on_update(update)
-                elif self._newest.is_over:
-                    break
+                except queue.Empty:
+                    if self._is_over.is_set() and self._newest.empty():
+                        break
                 if time.monotonic() >= next_status:
                     next_status = time.monotonic() + every_s
                     self._report()
         finally:
             self._stop.set()
             self.source.stop()
-            self._newest.end(self._newest.error)
             self._report()
             for sink in self.sinks:
                 sink.close()
             self.locator.close()
             reader.join(1.0)
-        if self._newest.error is not None:
-            raise self._newest.error
+        if self._error:
+            raise self._error[0]
         return self.status
 
     def _read(self) -> None:
@@ -190,12 +157,11 @@ class Live:
             try:
                 for arrival in self.source.frames():
                     self.status.fault = self._said = ""
-                    self._newest.put(arrival)
+                    self._put(arrival)
                     if self._stop.is_set():
                         return
-                if not self.source.is_live or not self._stop.is_set():
-                    self._newest.end()
-                    return
+                self._is_over.set()
+                return
             except SourceFault as fault:
                 self.status.fault = str(fault)
                 if str(fault) != self._said:
@@ -203,8 +169,21 @@ class Live:
                     self._say(f"{fault}; tried again")
                 self._stop.wait(_RETRY_S)
             except Exception as error:  # what a user has to mend, or a fault of ours: told by the caller's thread
-                self._newest.end(error)
+                self._error.append(error)
+                self._is_over.set()
                 return
+
+    def _put(self, arrival: Arrival) -> None:
+        """Put a frame in the place of one that nobody took in time, which is counted; recorded ones wait for that."""
+        while not self._stop.is_set():
+            try:
+                self._newest.put(arrival, timeout=0.0 if self.source.is_live else 0.05)
+                return
+            except queue.Full:
+                if self.source.is_live:
+                    with contextlib.suppress(queue.Empty):
+                        self._newest.get_nowait()
+                        self.status.dropped += 1
 
     def _located(self, arrival: Arrival) -> Update:
         """Return what a frame shows."""
@@ -220,7 +199,6 @@ class Live:
         if self._held:
             self._held, reason = self._held - 1, reason or "clock"
         latency_s = time.monotonic() - arrival.received_s
-        self.status.dropped = self._newest.n_dropped
         self.status.damaged = self.source.n_damaged
         why = located.match.reason if located.match is not None else ""
         self.status.note(f"{reason}: {why}" if reason and why else reason, latency_s, located.tracked)

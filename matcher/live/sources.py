@@ -156,12 +156,11 @@ class PrintedSource(StreamSource):
         self._header = b""
 
     def _parsed(self, lines: Lines) -> Iterator[Arrival]:
-        board, first = self._recognised(lines)
+        board = self._recognised(lines)
         if board is None:
-            yield from self._of_csv(lines, first)
+            yield from self._of_csv(lines)
             return
-        feed, n_zones = _Fed(lines, first), math.prod(self._shape)
-        log = prints.BoardLog(cast(Any, feed), self._path, n_zones, is_live=True)
+        log = prints.BoardLog(cast(Any, lines), self._path, math.prod(self._shape), is_live=True)
         log.others = {other.name: other.line for other in BOARDS.values() if other.line is not board.line}
         while not lines.fault and not lines.is_stopped:
             n_damaged = log.n_damaged
@@ -175,24 +174,26 @@ class PrintedSource(StreamSource):
                 self.spoilt(str(error))
             log.frame = None
 
-    def _recognised(self, lines: Lines) -> tuple[Board | None, list[bytes]]:
-        """Return the board whose lines arrive and the lines so far; None of lines of CSV."""
+    def _recognised(self, lines: Lines) -> Board | None:
+        """Return the board whose lines arrive, None of lines of CSV; the lines are then read again."""
         if self._named is not None and self._named in BOARDS:
-            return BOARDS[self._named], []
+            return BOARDS[self._named]
         held: list[bytes] = []
         n_pixels = math.prod(self._shape) * len(self._sensor.frequencies_hz)
         while line := lines.readline(LONGEST_LINE):
             held.append(line)
             board = find_board(self._named, b"".join(held), math.prod(self._shape), self._path)
-            if board is not None:
-                return board, held
             text = prints.plain(line)
+            if board is not None:
+                lines.unread(b"".join(held))
+                return board
             if _HEADER.search(text) or len(re.split(r"[;,\t]+", text.strip())) >= n_pixels:
-                return None, [line]
+                lines.unread(line)
+                return None
             if len(held) == _UNRECOGNISED_LINES:
                 break
         if lines.is_stopped or lines.fault:
-            return None, []
+            return None
         raise SourceFault(
             f"{self.name}: {len(held)} lines are of no known format, the last {prints.plain(held[-1])[:40]!r}: give"
             " board=…, or lines of JSON or CSV"
@@ -208,10 +209,9 @@ class PrintedSource(StreamSource):
         times = [] if printed.time_s is None else [printed.time_s]
         return recording_of(board, printed.distance_mm, printed.status, times, self._sensor, self._shape)
 
-    def _of_csv(self, lines: Lines, first: list[bytes]) -> Iterator[Arrival]:
+    def _of_csv(self, lines: Lines) -> Iterator[Arrival]:
         """Yield the frames of lines of CSV, below a header or without one."""
-        pending = list(first)
-        while line := pending.pop() if pending else lines.readline(LONGEST_LINE):
+        while line := lines.readline(LONGEST_LINE):
             text = prints.plain(line)
             if _HEADER.search(text):
                 self._header = line
@@ -234,17 +234,6 @@ class PrintedSource(StreamSource):
             self.spoilt(str(error))
             return
         yield Arrival(frames, lines.received_s)
-
-
-class _Fed:
-    """Lines that were read to recognise a board, and those that follow."""
-
-    def __init__(self, lines: Lines, first: list[bytes]) -> None:
-        self._lines, self._first = lines, first[::-1]
-
-    def readline(self, limit: int) -> bytes:
-        """Return the next line."""
-        return self._first.pop() if self._first else self._lines.readline(limit)
 
 
 class Tmf8829Source(Source):

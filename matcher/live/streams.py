@@ -7,7 +7,8 @@ import select
 import socket
 import sys
 import time
-from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from phasemark import UsageError
@@ -18,105 +19,41 @@ _WAIT_S = 0.05
 """How long a read waits at most: a source is stopped within that."""
 
 
-class Stream(ABC):
-    """Stream of bytes that may break and come back.
+class Stream:
+    """Stream of bytes that may break and come back: a port, a socket, or standard input.
 
     Parameters
     ----------
     name : str
         As the user gave it.
+    opened : callable
+        Opens it and returns what has a `fileno()` and a `close()`; an OSError tells why it cannot be opened.
+    ends : bool
+        Whether its end is the end of the work, not a fault.
+    datagrams : bool
+        Whether what arrives at once is whole lines.
     """
 
-    ends = False
-    """Whether its end is the end of the work, not a fault."""
+    def __init__(self, name: str, opened: Callable[[], Any], *, ends: bool = False, datagrams: bool = False) -> None:
+        self.name, self.ends = name, ends
+        self._opened, self._datagrams = opened, datagrams
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    @abstractmethod
     def open(self) -> None:
-        """Open it; an OSError tells why it cannot be opened."""
+        """Open it."""
+        self._file = self._opened()
 
-    @abstractmethod
     def read(self) -> bytes | None:
         """Return what has arrived, None where nothing did for a moment; b"" at the end."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close it."""
-
-
-class SerialStream(Stream):
-    """Serial port, or a pseudo-terminal."""
-
-    def __init__(self, name: str, path: str, baud: int) -> None:
-        super().__init__(name)
-        self._serial = needed("serial", f"the serial port {path}", "live")
-        self._path, self._baud = path, baud
-
-    def open(self) -> None:
-        """Open the port."""
-        self._port = self._serial.Serial(self._path, self._baud, timeout=_WAIT_S)
-        self._port.reset_input_buffer()  # what came before is old
-
-    def read(self) -> bytes | None:
-        """Return what has arrived."""
-        try:
-            found = self._port.read(max(1, self._port.in_waiting))
-        except TypeError:  # pyserial's own, where the port was closed meanwhile
-            return b""
-        return bytes(found) or None
-
-    def close(self) -> None:
-        """Close the port."""
-        self._port.close()
-
-
-class StandardInput(Stream):
-    """Standard input, line by line as a pipe delivers it."""
-
-    ends = True
-
-    def open(self) -> None:
-        """Take the file descriptor."""
-        self._file = sys.stdin.fileno()
-
-    def read(self) -> bytes | None:
-        """Return what has arrived."""
-        ready, _, _ = select.select([self._file], [], [], _WAIT_S)
-        return os.read(self._file, _CHUNK) if ready else None
-
-    def close(self) -> None:
-        """Leave it open: it is not ours."""
-
-
-class SocketStream(Stream):
-    """TCP connection to a server, or datagrams of UDP that are sent to a port of ours, each with whole lines."""
-
-    def __init__(self, name: str, host: str, port: int, *, datagrams: bool) -> None:
-        super().__init__(name)
-        self._address, self._datagrams = (host, port), datagrams
-
-    def open(self) -> None:
-        """Connect, or take the port."""
-        if self._datagrams:
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._socket.bind(self._address)
-        else:
-            self._socket = socket.create_connection(self._address, timeout=1.0)
-        self._socket.settimeout(_WAIT_S)
-
-    def read(self) -> bytes | None:
-        """Return what has arrived."""
-        try:
-            found = self._socket.recv(_CHUNK)
-        except TimeoutError:
+        ready, _, _ = select.select([self._file.fileno()], [], [], _WAIT_S)
+        if not ready:
             return None
-        return found if not self._datagrams or found.endswith(b"\n") else found + b"\n"
+        found = os.read(self._file.fileno(), _CHUNK)
+        return found + b"\n" if self._datagrams and not found.endswith(b"\n") else found
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
+        """Close it; standard input is not ours."""
+        if self._file is not sys.stdin:
+            self._file.close()
 
 
 class Lines:
@@ -138,6 +75,10 @@ class Lines:
         """When the last byte of the last line arrived, on the monotonic clock."""
         self.fault = ""
         """Why there are no more lines."""
+
+    def unread(self, lines: bytes) -> None:
+        """Put lines back, to be read again."""
+        self._held[:0] = lines
 
     def readline(self, limit: int) -> bytes:
         """Return the next line, at most `limit` bytes of it; b"" where there are no more."""
@@ -172,9 +113,9 @@ def open_stream(name: str) -> Stream | None:
         The address is wrong, or a package is missing.
     """
     if name == "-":
-        return StandardInput(name)
+        return Stream(name, lambda: sys.stdin, ends=True)
     if "://" not in name:
-        return SerialStream(name, name, 115200) if name.startswith("/dev/") else None
+        return _serial(name, name, 115200) if name.startswith("/dev/") else None
     parts = urlsplit(name)
     if parts.scheme == "serial":
         query = parse_qs(parts.query)
@@ -184,11 +125,32 @@ def open_stream(name: str) -> Stream | None:
             raise UsageError(
                 f"{name}: 'baud' must be a whole number, as in serial:///dev/ttyUSB0?baud=921600"
             ) from None
-        return SerialStream(name, parts.netloc + parts.path, baud)
+        return _serial(name, parts.netloc + parts.path, baud)
     if parts.scheme in ("tcp", "udp"):
         host, port = address_of(name)
-        return SocketStream(name, host or "0.0.0.0", port, datagrams=parts.scheme == "udp")
+        if parts.scheme == "udp":
+            return Stream(name, lambda: _bound(host or "0.0.0.0", port), datagrams=True)
+        return Stream(name, lambda: socket.create_connection((host or "0.0.0.0", port), timeout=1.0))
     return None
+
+
+def _serial(name: str, path: str, baud: int) -> Stream:
+    """Return a serial port, or a pseudo-terminal."""
+    serial = needed("serial", f"the serial port {path}", "live")
+
+    def opened() -> Any:
+        port = serial.Serial(path, baud, timeout=0)
+        port.reset_input_buffer()  # what came before is old
+        return port
+
+    return Stream(name, opened)
+
+
+def _bound(host: str, port: int) -> socket.socket:
+    """Return a socket to which datagrams of whole lines are sent."""
+    bound = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    bound.bind((host, port))
+    return bound
 
 
 def address_of(name: str) -> tuple[str, int]:
