@@ -31,15 +31,15 @@ from phasemark.matcher.drive.odometry import World
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.position import Placement
-from phasemark.matcher.sequence import OdometryModel, OdometryPlan, PoseFilter, Reading
+from phasemark.matcher.sequence import OdometryPlan, PoseFilter, Reading
 from phasemark.matcher.sequence.odometry import motion_jacobian, motion_noise, moved
 from phasemark.matcher.sequence.planar import lens_pose, view_of
 from phasemark.matcher.statistics import nees
 from phasemark.render import Background, capture
 
 OFFSETS = ((0.1, -0.03), (0.04, 0.02))
-MODEL = OdometryModel.of(OdometryPlan())
-EXACT = OdometryModel(0, 0, 0, 0, 0, 0, 0)
+MODEL = OdometryPlan()
+EXACT = OdometryPlan(**dict.fromkeys(OdometryPlan.model_fields, 0.0))
 
 
 @pytest.fixture(scope="module")

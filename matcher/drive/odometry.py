@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.sequence.odometry import OdometryModel, Reading
+from phasemark.matcher.sequence.odometry import OdometryPlan, Reading
 
 
 class World:
@@ -19,7 +19,7 @@ class World:
         Where the robot believes it starts.
     pose_covariance : (3, 3) float64
         Of that belief.
-    model : OdometryModel
+    model : OdometryPlan
     rng : numpy.random.Generator
     """
 
@@ -27,7 +27,7 @@ class World:
         self,
         pose: NDArray[np.float64],
         pose_covariance: NDArray[np.float64],
-        model: OdometryModel,
+        model: OdometryPlan,
         rng: np.random.Generator,
     ) -> None:
         self._model, self._rng = model, rng
@@ -49,20 +49,21 @@ class World:
         noise = self._rng.standard_normal(5)
         _, _, heading, slip, bias = self.state
         middle = heading + turn_rad / 2
-        along = (1 - slip) * wheels_m + model.along * math.sqrt(way) * noise[0]
-        across = model.across * math.sqrt(way) * noise[1]
+        along = (1 - slip) * wheels_m + model.along_m_per_sqrt_m * math.sqrt(way) * noise[0]
+        across = model.across_m_per_sqrt_m * math.sqrt(way) * noise[1]
         self.state = np.array(
             [
                 self.state[0] + along * math.cos(middle) - across * math.sin(middle),
                 self.state[1] + along * math.sin(middle) + across * math.cos(middle),
                 math.remainder(heading + turn_rad, math.tau),
-                slip + model.slip_walk * math.sqrt(way) * noise[3],
-                bias + model.bias_walk * math.sqrt(time_s) * noise[4],
+                slip + model.slip_walk_per_sqrt_m * math.sqrt(way) * noise[3],
+                bias + math.radians(model.gyro_bias_walk_deg_s_per_sqrt_s) * math.sqrt(time_s) * noise[4],
             ]
         )
-        read = turn_rad + bias * time_s + model.turn * math.sqrt(time_s) * noise[2]
+        read = turn_rad + bias * time_s + math.radians(model.gyro_noise_deg_per_sqrt_s) * math.sqrt(time_s) * noise[2]
         return Reading(wheels_m, read, time_s)
 
     def stand(self, time_s: float) -> None:
         """Advance time at rest: only the bias changes."""
-        self.state[4] += self._model.bias_walk * math.sqrt(time_s) * self._rng.standard_normal()
+        walk = math.radians(self._model.gyro_bias_walk_deg_s_per_sqrt_s)
+        self.state[4] += walk * math.sqrt(time_s) * self._rng.standard_normal()

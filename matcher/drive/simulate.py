@@ -23,7 +23,7 @@ from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.position.landmark_map import MappedLandmark
-from phasemark.matcher.sequence.odometry import OdometryModel, moved
+from phasemark.matcher.sequence.odometry import moved
 from phasemark.matcher.sequence.planar import lens_pose, view_of
 from phasemark.matcher.sequence.pose_filter import PoseFilter
 from phasemark.matcher.statistics import nees
@@ -282,9 +282,8 @@ class _Driver:
         self.plan, self.seed, self.equipment, self.rng = plan, seed, equipment, rng
         self.path = Path(plan.path.waypoints_m)
         start = np.array([*plan.path.waypoints_m[0], self.path.start_heading_rad])
-        model = OdometryModel.of(plan.odometry)
-        self.world = World(start, plan.path.start_covariance, model, rng)
-        self.filter = PoseFilter(start.tolist(), plan.path.start_covariance, model, plan.stop.gate)
+        self.world = World(start, plan.path.start_covariance, plan.odometry, rng)
+        self.filter = PoseFilter(start.tolist(), plan.path.start_covariance, plan.odometry, plan.stop.gate)
         self.dead = np.array([*start, 0.0, 0.0])
         self.time_s = self.way_m = 0.0
         self.not_before_m: dict[str, float] = {}

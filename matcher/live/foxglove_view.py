@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from phasemark import UsageError
 from phasemark.matcher.live.extras import needed
-from phasemark.matcher.live.sinks import Sink, as_dict
+from phasemark.matcher.live.sinks import Sink, as_dict, plain_rows
 
 if TYPE_CHECKING:
     from phasemark.matcher.live.session import Update
@@ -52,8 +52,7 @@ class FoxgloveSink(Sink):
         """Send a pose, if it is accepted, and what is known."""
         found, now = update.located.estimate, int(update.time_s * 1e9)
         self._update.log(as_dict(update), log_time=now)
-        rows = [[None if value != value else value for value in row] for row in update.zones_m.tolist()]
-        self._zones.log({"range_m": rows}, log_time=now)
+        self._zones.log({"range_m": plain_rows(update.zones_m)}, log_time=now)
         if not update.reason and found.pose is not None:
             own, heading = self._messages, float(found.pose[2])
             pose = own.Pose(

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from phasemark import InputFileError
 from phasemark.matcher.live.extras import needed
-from phasemark.matcher.live.sinks import Sink, as_dict, open_output
+from phasemark.matcher.live.sinks import Sink, as_dict, open_output, plain_rows
 from phasemark.matcher.live.sources import Replay
 from phasemark.render import Frames, Sensor
 
@@ -121,16 +120,12 @@ class McapSource(Replay):
 def _frame_dict(frames: Frames) -> dict[str, Any]:
     """Return one frame as plain numbers, each with all of its digits."""
     row: dict[str, Any] = {"stamp_s": None if frames.time_s is None else float(frames.time_s.flat[0])}
-    row["range_m"] = _plain(frames.range_m)
+    row["range_m"] = plain_rows(frames.range_m.ravel())
     row["flags"] = frames.flags.ravel().tolist()
     for name in ("amplitude_e", "intensity_e", "tilt_rad"):
         if (values := getattr(frames, name)) is not None:
-            row[name] = _plain(values)
+            row[name] = plain_rows(values.ravel())
     return row
-
-
-def _plain(values: NDArray[np.float64]) -> list[float | None]:
-    return [None if value != value else value for value in values.ravel().tolist()]
 
 
 def _frames_of(row: dict[str, Any], sensor: Sensor, path: Path) -> Frames:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.live.session import Update
-from phasemark.matcher.live.sinks import as_dict
+from phasemark.matcher.live.sinks import as_dict, plain_rows
 from phasemark.matcher.position.robot_pose import PRIOR_STD
 from phasemark.render import Renderer, Views
 from phasemark.render.phasor_images import wrap_difference_m
@@ -36,7 +36,7 @@ class Pictures:
 
     def of(self, update: Update) -> dict[str, Any]:
         """Return zones and residuals, rows from the top, None where there is none, and the pose as JSON has it."""
-        found: dict[str, Any] = {**as_dict(update), "range_m": _plain(update.zones_m), "residual_mm": None}
+        found: dict[str, Any] = {**as_dict(update), "range_m": plain_rows(update.zones_m.round(4)), "residual_mm": None}
         found["poses"] = [[round(share, 4), *pose.round(4).tolist()] for share, pose in update.located.estimate.poses]
         if not update.reason:
             found["std"] = np.sqrt(np.diag(found["covariance"])).tolist()
@@ -44,7 +44,7 @@ class Pictures:
         if bank and frames and match and match.class_name is not None and math.isfinite(match.distance_m):
             residual_m = wrap_difference_m(frames.range_m[0] - self._model(bank, match), bank.sensor)
             residual_m = np.where(np.abs(residual_m) > _MOST_M, np.nan, residual_m)
-            found["residual_mm"] = _plain(1e3 * (residual_m - bank.camera.range_offset_m))
+            found["residual_mm"] = plain_rows((1e3 * (residual_m - bank.camera.range_offset_m)).round(4))
             found["class"] = match.class_name
         return found
 
@@ -56,11 +56,3 @@ class Pictures:
             self._renderers[name] = Renderer(mesh, bank.sensor, albedo=float(mesh.metadata["albedo"]))
         views = Views.broadcast(*(getattr(match, field) for field in VIEW_FIELDS))
         return np.asarray(self._renderers[name].render_views(views, background=match.background).range_m[0])
-
-
-def _plain(values: NDArray[np.float64]) -> list[list[float | None]]:
-    return [[_or_none(round(value, 4)) for value in row] for row in values.tolist()]
-
-
-def _or_none(value: float) -> float | None:
-    return value if math.isfinite(value) else None

@@ -96,6 +96,13 @@ def as_dict(update: Update) -> dict[str, Any]:
     return row
 
 
+def plain_rows(values: NDArray[np.float64]) -> Any:
+    """Return numbers as lists for JSON, None where there is none."""
+    if values.ndim > 1:
+        return [plain_rows(row) for row in values]
+    return [value if math.isfinite(value) else None for value in values.tolist()]
+
+
 def planar_covariance(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the covariance of (x, y, z, roll, pitch, yaw), (6, 6), of a pose in the plane."""
     whole = np.eye(6) * UNKNOWN_VARIANCE

@@ -58,13 +58,19 @@ class Wall(PlanModel):
         """Ends x, y, x, y, (4,)."""
         return np.array([*self.from_m, *self.to_m])
 
+    @property
+    def normal(self) -> _Float:
+        """Direction to the left of its way from end to end, (2,)."""
+        x, y = self.ends_m[2:] - self.ends_m[:2]
+        return np.array([-y, x]) / math.hypot(x, y)
+
     def outline(self) -> _Float:
         """Return its faces, (1 or 4, 4); a thick wall extends by half its thickness, so that corners are closed."""
         ends, half = self.ends_m, self.thickness_m / 2
         if not half:
             return ends[None]
-        along = half * (ends[2:] - ends[:2]) / math.dist(self.from_m, self.to_m)
-        across = np.array([-along[1], along[0]])
+        across = half * self.normal
+        along = np.array([across[1], -across[0]])
         return _polygon([ends[:2] - along - across, ends[2:] + along - across,
                          ends[2:] + along + across, ends[:2] - along + across])  # fmt: skip
 
@@ -209,18 +215,13 @@ class WallMap(PlanModel):
         UsageError
             Nothing of the map is as high as the sensors.
         """
-        groups, normals, stds = [], [], []
-        for wall in self.walls:
-            seen = wall.base_m <= self.height_m <= wall.base_m + wall.height_m
-            groups.append(wall.outline() if seen else np.empty((0, 4)))
-            along = (wall.ends_m[2:] - wall.ends_m[:2]) / math.dist(wall.from_m, wall.to_m)
-            normals.append([-along[1], along[0]])
-            stds.append(wall.std_m)
+        walls = self.walls
         bodies: tuple[Box | MeshBody | LandmarkBody, ...] = (*self.box, *self.mesh, *self.landmark)
-        for body in bodies:
-            groups.append(body.outline(self.height_m))
-            normals.append([0.0, 0.0])
-            stds.append(0.0)
+        seen = [wall.base_m <= self.height_m <= wall.base_m + wall.height_m for wall in walls]
+        groups = [wall.outline() if high else np.empty((0, 4)) for wall, high in zip(walls, seen, strict=True)]
+        groups += [body.outline(self.height_m) for body in bodies]
+        normals = [*(wall.normal for wall in walls), *(np.zeros(2) for _ in bodies)]
+        stds = [*(wall.std_m for wall in walls), *(0.0 for _ in bodies)]
         pieces = np.concatenate(groups)
         if not len(pieces):
             raise UsageError(f"'height_m' must be a height at which the map has walls or bodies, got {self.height_m:g}")
@@ -232,8 +233,7 @@ class WallMap(PlanModel):
         """Return the map with each wall displaced along its normal, (walls,) m."""
         moved = []
         for wall, by in zip(self.walls, displacement_m, strict=True):
-            along = (wall.ends_m[2:] - wall.ends_m[:2]) / math.dist(wall.from_m, wall.to_m)
-            ends = wall.ends_m + by * np.tile([-along[1], along[0]], 2)
+            ends = wall.ends_m + by * np.tile(wall.normal, 2)
             moved.append(wall.model_copy(update={"from_m": tuple(ends[:2].tolist()), "to_m": tuple(ends[2:].tolist())}))
         return self.model_copy(update={"wall": tuple(moved), "walls_m": ()})
 

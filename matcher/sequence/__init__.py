@@ -6,7 +6,7 @@ from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
     from phasemark.matcher.sequence.free_motion import FreeMotion
-    from phasemark.matcher.sequence.odometry import OdometryModel, OdometryPlan, Reading
+    from phasemark.matcher.sequence.odometry import OdometryPlan, Reading
     from phasemark.matcher.sequence.pose_estimator import Estimate, PoseEstimator
     from phasemark.matcher.sequence.pose_filter import Motion, PoseFilter, Sighting
     from phasemark.matcher.sequence.standing import Standing
@@ -17,7 +17,6 @@ __all__ = [
     "Estimate",
     "FreeMotion",
     "Motion",
-    "OdometryModel",
     "OdometryPlan",
     "PoseEstimator",
     "PoseFilter",

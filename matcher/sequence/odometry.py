@@ -16,6 +16,24 @@ STATE = ("x_m", "y_m", "heading_rad", "slip", "gyro_bias_rad_s")
 """What the filter estimates: the pose, and the two errors that last."""
 
 
+@dataclass(frozen=True)
+class Reading:
+    """Odometry of one step.
+
+    Parameters
+    ----------
+    way_m : float
+        From the wheel encoders.
+    turn_rad : float
+        From the gyro.
+    time_s : float
+    """
+
+    way_m: float
+    turn_rad: float
+    time_s: float
+
+
 class OdometryPlan(PlanModel):
     """Errors of wheels and gyro; the filter is given these standard deviations, not the errors.
 
@@ -45,63 +63,11 @@ class OdometryPlan(PlanModel):
     gyro_bias_walk_deg_s_per_sqrt_s: Std = 0.005
     gyro_noise_deg_per_sqrt_s: Std = 0.1
 
-
-@dataclass(frozen=True)
-class Reading:
-    """Odometry of one step.
-
-    Parameters
-    ----------
-    way_m : float
-        From the wheel encoders.
-    turn_rad : float
-        From the gyro.
-    time_s : float
-    """
-
-    way_m: float
-    turn_rad: float
-    time_s: float
-
-
-@dataclass(frozen=True)
-class OdometryModel:
-    """The standard deviations of an :class:`OdometryPlan`, radians.
-
-    Parameters
-    ----------
-    slip_std, slip_walk, along, across : float
-        Walk and errors of the way per √m.
-    bias_std_rad_s, bias_walk, turn : float
-        Walk and angle random walk per √s.
-    """
-
-    slip_std: float
-    slip_walk: float
-    along: float
-    across: float
-    bias_std_rad_s: float
-    bias_walk: float
-    turn: float
-
-    @classmethod
-    def of(cls, plan: OdometryPlan) -> OdometryModel:
-        """Take the figures of a plan."""
-        return cls(
-            slip_std=plan.slip_std,
-            slip_walk=plan.slip_walk_per_sqrt_m,
-            along=plan.along_m_per_sqrt_m,
-            across=plan.across_m_per_sqrt_m,
-            bias_std_rad_s=math.radians(plan.gyro_bias_std_deg_s),
-            bias_walk=math.radians(plan.gyro_bias_walk_deg_s_per_sqrt_s),
-            turn=math.radians(plan.gyro_noise_deg_per_sqrt_s),
-        )
-
     def start(self, pose_covariance: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the covariance of the whole state at the start, (5, 5)."""
         covariance = np.zeros((5, 5))
         covariance[:3, :3] = pose_covariance
-        covariance[3, 3], covariance[4, 4] = self.slip_std**2, self.bias_std_rad_s**2
+        covariance[3, 3], covariance[4, 4] = self.slip_std**2, math.radians(self.gyro_bias_std_deg_s) ** 2
         return covariance
 
     def step(
@@ -112,7 +78,7 @@ class OdometryModel:
 
     def stand(self, covariance: NDArray[np.float64], time_s: float) -> None:
         """Advance time at rest, in place: the pose stays, the variance of the bias grows."""
-        covariance[4, 4] += self.bias_walk**2 * time_s
+        covariance[4, 4] += math.radians(self.gyro_bias_walk_deg_s_per_sqrt_s) ** 2 * time_s
 
 
 def moved(state: NDArray[np.float64], reading: Reading) -> NDArray[np.float64]:
@@ -147,19 +113,20 @@ def motion_jacobian(state: NDArray[np.float64], reading: Reading) -> NDArray[np.
     return jacobian
 
 
-def motion_noise(state: NDArray[np.float64], reading: Reading, model: OdometryModel) -> NDArray[np.float64]:
+def motion_noise(state: NDArray[np.float64], reading: Reading, model: OdometryPlan) -> NDArray[np.float64]:
     """Return the covariance that a step adds, (5, 5).
 
     Parameters
     ----------
     state : (5,) float64
     reading : Reading
-    model : OdometryModel
+    model : OdometryPlan
     """
     way = abs(reading.way_m)
     axes = rotation(state[2])
     noise = np.zeros((5, 5))
-    noise[:2, :2] = axes @ np.diag([model.along**2 * way, model.across**2 * way]) @ axes.T
-    noise[2, 2] = model.turn**2 * reading.time_s
-    noise[3, 3], noise[4, 4] = model.slip_walk**2 * way, model.bias_walk**2 * reading.time_s
+    noise[:2, :2] = axes @ np.diag(np.square([model.along_m_per_sqrt_m, model.across_m_per_sqrt_m]) * way) @ axes.T
+    noise[2, 2] = math.radians(model.gyro_noise_deg_per_sqrt_s) ** 2 * reading.time_s
+    noise[3, 3] = model.slip_walk_per_sqrt_m**2 * way
+    noise[4, 4] = math.radians(model.gyro_bias_walk_deg_s_per_sqrt_s) ** 2 * reading.time_s
     return noise

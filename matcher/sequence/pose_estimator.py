@@ -85,7 +85,7 @@ class PoseEstimator:
     standing : Standing
         Place of the landmark, and of the camera on the robot.
     motion : Motion
-        How the robot moves: :class:`~phasemark.matcher.sequence.OdometryModel` with odometry,
+        How the robot moves: :class:`~phasemark.matcher.sequence.OdometryPlan` with odometry,
         :class:`~phasemark.matcher.sequence.FreeMotion` without.
     gate : float
         A match as improbable as 1 − gate is refused.
