@@ -198,14 +198,17 @@ class RenderedModel(ImageModel):
         free: Sequence[str],
         step: NDArray[np.float64],
     ) -> NDArray[np.complex128]:
-        """Render both ends, those of all parameters that change the same rows at once."""
+        """Render both ends, those of all parameters that change the same rows at once.
+
+        Of one view those of all parameters: a call costs more than rows that do not change.
+        """
         slope = np.zeros((len(view), len(free), self.sensor.rows * self.sensor.cols), np.complex128)
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            together: dict[tuple[tuple[int, int] | None, int], list[int]] = {}
+            together: dict[tuple[int, int] | None, list[int]] = {}
             for k, name in enumerate(free):
-                together.setdefault(self._changing_rows(name, view[of]), []).append(k)
-            for (rows, first), own in together.items():
+                together.setdefault(self._changing_rows(name, view[of])[0] if len(of) > 1 else None, []).append(k)
+            for rows, own in together.items():
                 ends = np.tile(view[of], (2 * len(own), 1, 1))
                 axes = [VIEW.index(free[k]) for k in own]
                 for j, (k, axis) in enumerate(zip(own, axes, strict=True)):
@@ -217,7 +220,9 @@ class RenderedModel(ImageModel):
                 phasor = self._render(c, moved, each, rows).phasor.reshape(len(ends), len(of), -1)
                 for j, (k, axis) in enumerate(zip(own, axes, strict=True)):
                     width = np.maximum(ends[2 * j, :, axis] - ends[2 * j + 1, :, axis], STEP)
-                    slope[of, k, first:] = (phasor[2 * j] - phasor[2 * j + 1]) / width[:, None]
+                    first = self._changing_rows(free[k], view[of])[1]
+                    there = phasor[2 * j : 2 * j + 2, :, first if rows is None else 0 :]
+                    slope[of, k, first:] = (there[0] - there[1]) / width[:, None]
         return slope
 
     def differences(
