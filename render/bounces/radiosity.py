@@ -11,6 +11,8 @@ from phasemark.render.bounces.transport import Operator
 
 _MOST = 1000
 """Bounces after which light that still goes on is given up."""
+_REST = 0.1
+"""Share of the tolerance that the light left out may come to: a bounce costs little beside the patches."""
 _SMALL = 1e-2
 """Powers of a free albedo whose coefficients are below this share of the tolerance are left out."""
 
@@ -36,7 +38,7 @@ def arriving(
         From :meth:`~phasemark.render.bounces.transport.Transport.operator`.
     albedo : (n,) float64
     bounces : int or "all"
-        "all": until what is left is below `tolerance`.
+        "all": until what is left is well below `tolerance`.
     tolerance : float
         Share of the light that has bounced once.
     free : (n,) bool, optional
@@ -70,7 +72,7 @@ def arriving(
         before, size = size, float(np.abs(term).max(initial=0.0))
         first = first or size
         # what is left is at most a geometric series
-        if size == 0 or (k and size < before and size * size / (before - size) <= tolerance * first):
+        if size == 0 or (k and size < before and size * size / (before - size) <= _REST * tolerance * first):
             return found
     if bounces == "all":
         raise UsageError(
