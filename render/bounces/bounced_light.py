@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -27,6 +28,8 @@ _PILOT = 0.5
 """Size of the first, coarse patches as a share of their distance from the lens."""
 _COARSEST, _LAST = 0.28, 0.06
 """Sizes between which patches are refined."""
+_FINEST, _OF_PIXEL = 0.14, 0.4
+"""Smallest size where surfaces meet: share of the size elsewhere, and of a pixel, whichever is larger."""
 _ENOUGH = 2
 """Bounces by which the patches are refined."""
 _FINER = 2**-0.5
@@ -96,7 +99,9 @@ class BouncedLight:
         self._least_cosine = float(self._rays[:, 0].min())
         self.patches = make_patches(topology, even_sizes(_PILOT, poses.lens), intersector=kind)
         self.transport = transport_between(self.patches)
-        sizes = sizes_for_light(even_sizes(size, poses.lens), self.patches, self._brightness())
+        pixel = math.sqrt(self._grid.scale_u * self._grid.scale_v)
+        finest = max(_FINEST, _OF_PIXEL / pixel / size)
+        sizes = sizes_for_light(even_sizes(size, poses.lens), self.patches, self._brightness(), finest)
         self.patches = make_patches(topology, sizes, intersector=kind)
         self.transport = transport_between(self.patches)
 

@@ -10,8 +10,6 @@ from phasemark.render.bounces.patches import Patches, SizeAt
 
 _BRIGHT, _DIMMEST = 0.3, 0.004
 """Shares of the brightest patch's light from which on, and down to which, patches grow in darkness."""
-_FINEST = 0.14
-"""Smallest size where surfaces meet, as a share of the size where they do not."""
 _GAP = 0.5
 """Size where surfaces are close, as a share of the gap between them."""
 _CONTINUES = 0.5
@@ -27,11 +25,11 @@ def even_sizes(share: float, lens_m: NDArray[np.float64]) -> SizeAt:
     return size_at
 
 
-def sizes_for_light(wanted_at: SizeAt, coarse: Patches, light: NDArray[np.float64]) -> SizeAt:
+def sizes_for_light(wanted_at: SizeAt, coarse: Patches, light: NDArray[np.float64], finest: float) -> SizeAt:
     """Return sizes that follow the light on coarse patches, (n,), and the gaps between surfaces.
 
     Light counts twice, for what a patch sends on and for what of it returns; sizes go with its fourth root inverted.
-    Near another surface a patch is as large as the gap.
+    Near another surface a patch is half as large as the gap, or `finest` as a share of its size elsewhere.
     """
     darkness = np.clip(light / (_BRIGHT * light.max()), _DIMMEST / _BRIGHT, 1.0) ** -0.25
     reach = float(np.ptp(coarse.centre, axis=0).max())  # normals count as much as places
@@ -42,7 +40,7 @@ def sizes_for_light(wanted_at: SizeAt, coarse: Patches, light: NDArray[np.float6
         sides = [tree.query(np.concatenate([points, side * reach * normals], axis=1)) for side in (1, -1)]
         (away, near), (away_behind, near_behind) = sides
         dark = np.where(away < away_behind, darkness[near], darkness[near_behind])
-        return np.asarray(dark * np.clip(_GAP * _gaps(points, normals, coarse), _FINEST * wanted, wanted))
+        return np.asarray(dark * np.clip(_GAP * _gaps(points, normals, coarse), finest * wanted, wanted))
 
     return size_at
 
