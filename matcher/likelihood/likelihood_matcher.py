@@ -305,10 +305,7 @@ class LikelihoodMatcher:
             if key in known:
                 return known[key]
             renderer, width_rad = light[class_index], self._bank.sensor.pixel_rad
-            images = [
-                renderer.render(distance_m, delta_rad, share * width_rad, workers=self._workers)
-                for share in _SHARES_OF_COLUMN
-            ]
+            images = [renderer.render(distance_m, delta_rad, share * width_rad) for share in _SHARES_OF_COLUMN]
             if self._auto:
                 known[key] = images
             return images
