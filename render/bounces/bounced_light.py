@@ -254,8 +254,8 @@ def refined(
     topology, intersector, sensor, poses, kind
         As :class:`BouncedLight` has them.
     tolerance : float
-        Largest change of a pixel of the first pose, at the highest frequency, when the patches shrink by √2, as a share
-        of the brightest pixel's direct light.
+        Root mean square over the pixels of the first pose of the change at the highest frequency when the patches
+        shrink by √2, as a share of the brightest pixel's direct light.
 
     Raises
     ------
@@ -267,7 +267,7 @@ def refined(
         found = BouncedLight(topology, intersector, sensor, of_poses(poses, slice(0, 1)), size, kind)
         light = found.phasors([max(sensor.frequencies_hz)], _ENOUGH, tolerance)[0, :, 0, 0]
         if before is not None:
-            change = float(np.abs(light - before).max()) / found.brightest
+            change = float(np.sqrt(np.mean(np.abs(light - before) ** 2))) / found.brightest
         if change <= tolerance:
             return found if len(poses.lens) == 1 else BouncedLight(topology, intersector, sensor, poses, size, kind)
         before, size = light, _FINER * size

@@ -48,7 +48,7 @@ class SceneRenderer:
     bounces : int or "all"
         How often light may bounce on its way from the first surface that it meets to the last (PHYSICS section 12).
     bounce_tolerance : float
-        Patches are refined until no pixel of the first image changes by more than this share of the brightest one.
+        Patches are refined until the image changes by less than this share of its brightest pixel, root mean square.
 
     Raises
     ------
@@ -75,7 +75,7 @@ class SceneRenderer:
         harmonics: Sequence[int] | None = None,
         intersector: str = "auto",
         bounces: Bounces = 0,
-        bounce_tolerance: float = 3e-3,
+        bounce_tolerance: float = 1e-3,
     ) -> None:
         if not isinstance(scene, Scene):
             raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
