@@ -41,7 +41,7 @@ from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors,
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.one_frequency import OneFrequency
-from phasemark.render import Background, Frames
+from phasemark.render import Background, Frames, Renderer
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
@@ -318,6 +318,14 @@ class Matcher:
         if on == "reported":
             frames = frames.with_chip_error()
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
+
+    def renderer(self, class_name: str) -> Renderer:
+        """Return what renders a landmark of the bank, with what matching has computed of the light around it."""
+        own = self._by_evidence[0] if self._by_evidence else self
+        if own.method == "refine" and isinstance(own._method, LikelihoodMatcher):
+            return own._method.renderer(self.bank.classes.index(class_name))
+        mesh = self.bank.mesh(class_name)
+        return Renderer(mesh, self.bank.sensor, albedo=float(mesh.metadata["albedo"]))
 
     @property
     def is_quick(self) -> bool:

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank, build_bank
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, capture, preset
+from phasemark.matcher.accuracy.multipath import multipath_shift
+from phasemark.matcher.diagnosis.search import wider
+from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture, preset
 from phasemark.render.bounces import standing
 
 GOLDEN = Path(__file__).parent / "golden" / "multipath.npz"
@@ -84,6 +86,40 @@ def test_what_bounces_is_a_polynomial_in_the_floors_albedo(renderer: Renderer) -
     assert found[0] < 0.2 * found[2]  # most of what reaches the box has met the floor
     third = found[3] - 3 * found[2] + 3 * found[1] - found[0]
     assert abs(third) < 0.02 * found[3]
+
+
+@pytest.mark.parametrize("scene", ["stated", "unknown"])
+def test_the_shift_that_is_told_is_that_of_foreign_frames(
+    known: dict[str, Any], renderer: Renderer, bank: Bank, scene: str
+) -> None:
+    behind = BEHIND if scene == "stated" else None
+    told = multipath_shift(renderer, Views.broadcast(1.0), free=("distance_m", "delta_rad"), background=behind)
+    assert told is not None
+    assert told.floor_albedo == 0.5
+    assert told.floor_m == pytest.approx(0.15, abs=0.01)
+    matcher = Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=behind or "unknown", systematic=())
+    like = renderer.render(1.0, background=BEHIND)
+    errors = [
+        matcher.match(kalman_filter(capture(_frames(known, like), bank.sensor, n_frames=500, rng=rng)))[0].distance_m
+        - 1
+        for rng in map(np.random.default_rng, range(N))
+    ]
+    assert told.shift[0] == pytest.approx(np.mean(errors), rel=0.15)
+    assert str(told).startswith("multipath is off: a floor of albedo 0.5, 0.15 m below the lens, moves D by +")
+
+
+def test_nothing_is_told_of_multipath_that_is_modelled_or_of_an_unknown_lamp(renderer: Renderer, mesh: Any) -> None:
+    view = Views.broadcast(1.0)
+    assert multipath_shift(renderer, view, background=replace(BEHIND, bounces="all")) is None
+    assert multipath_shift(Renderer(mesh, preset("pmd-16x16")), view) is None
+
+
+def test_a_lamp_that_lights_little_more_than_the_image_takes_a_free_bearing_and_a_diagnosis(bank: Bank) -> None:
+    image = Renderer(bank.mesh("box"), bank.sensor, albedo=0.8).render(1.0, 0.1, 0.02)
+    frames = kalman_filter(capture(image, bank.sensor, n_frames=50, rng=np.random.default_rng(0)))
+    answer = Matcher(bank, "refine", background="unknown", systematic=()).match(frames)[0]
+    assert answer.accepted
+    assert wider(bank.sensor, 1.1).lamp_half_angle_deg == pytest.approx(17.6)
 
 
 def _frames(known: dict[str, Any], like: PhasorImages) -> PhasorImages:

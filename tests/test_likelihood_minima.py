@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from random_parts import KINDS, random_part
+from scipy.stats import binom, chi2
 
 from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
@@ -16,7 +17,7 @@ from phasemark.matcher.likelihood.refine import costs_at, refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
-from phasemark.render import Background, Renderer, Views, capture
+from phasemark.render import Background, Renderer, Views, capture, preset
 
 FIXED, BEARING = ("distance_m", "delta_rad"), ("distance_m", "delta_rad", "bearing_rad")
 
@@ -201,3 +202,46 @@ def test_odds_of_two_classes_are_those_of_their_likelihoods_integrated_over_all_
     assert abs(np.median(off)) < 0.3
     assert np.mean(np.abs(off) < 1.0) >= 0.85
     assert np.abs(off).max() < 6.0  # no class is given up whose likelihood is not
+
+
+def test_covariances_hold_where_an_edge_reaches_a_border_of_wide_pixels():
+    # near these views the cost is flat over a degree to one side, or the valley bends, and slopes about the solution
+    # claim less than a tenth of a degree; the likelihood itself says what is known
+    sensor, wall = preset("vl53l5cx-8x8").with_(histogram=None), Background(wall_m=1.6)
+    bank = build_bank(
+        {"classes": ("cone",), "sensor": "vl53l5cx-8x8", "distance_m": "0.46:0.66:0.02", "delta_deg": "-20:20:2"}
+    )
+    truth = np.array([[0.522672, -0.514275, 5.65921], [0.597952, -6.836282, 3.76438], [0.63, -8.94, -1.04]])
+    truth[:, 1:] = np.radians(truth[:, 1:])
+    draws, p = 40, 3
+    truth = np.repeat(truth, draws, axis=0)
+    image = Renderer(bank.mesh("cone"), sensor, albedo=0.8).render(*truth.T, background=wall)
+    frames = capture(image, sensor, rng=np.random.default_rng(1), n_frames=1)
+    with bank:
+        found = Matcher(bank, "refine", background=wall).match(kalman_filter(frames))
+    error = np.column_stack([found.distance_m, found.delta_rad, found.bearing_rad]) - truth
+    error[:, 1] = np.remainder(error[:, 1] + math.pi / 2, math.pi) - math.pi / 2
+    some = found.accepted
+    assert some.mean() > 0.9
+    squared = np.array(
+        [e @ np.linalg.solve(one.covariance, e) for e, one in zip(error, found, strict=True) if one.accepted]
+    )
+    inside = int((squared < chi2.ppf(0.95, p)).sum())
+    assert inside >= binom.ppf(0.002, len(squared), 0.95)
+    assert squared.max() < chi2.isf(1e-3 / len(squared), p)
+
+
+def test_the_right_view_is_found_where_its_cell_is_no_local_minimum():
+    sensor, wall = preset("vl53l5cx-4x4").with_(histogram=None), Background(wall_m=1.6)
+    bank = build_bank(
+        {"classes": ("cone",), "sensor": "vl53l5cx-4x4", "distance_m": "0.35:1:0.02", "delta_deg": "-44:44:2"}
+    )
+    truth = np.array([[0.6602, 37.0, -4.372], [0.6643, 30.61, -4.384], [0.5239, -35.49, 5.346], [0.5884, 35.36, -4.57]])
+    truth[:, 1:] = np.radians(truth[:, 1:])
+    image = Renderer(bank.mesh("cone"), sensor, albedo=0.8).render(*truth.T, background=wall)
+    frames = capture(image, sensor, rng=np.random.default_rng(5), n_frames=1)
+    with bank:
+        found = Matcher(bank, "refine", background=wall).match(kalman_filter(frames))
+    assert "poor fit" not in found.reason
+    np.testing.assert_allclose(found.distance_m, truth[:, 0], atol=0.005)
+    assert np.abs(np.sin(found.delta_rad - truth[:, 1])).max() < math.radians(2)

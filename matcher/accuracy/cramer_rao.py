@@ -175,7 +175,7 @@ def cramer_rao(
         if terms := carried_errors(one.camera, systematic):
             raise UsageError(f'systematic="{next(iter(terms))}" takes a sensor of one modulation frequency')
     sensor = renderer.sensor
-    image, slope = _image_and_slopes(renderer, views, free, background, workers)
+    image, slope = image_and_slopes(renderer, views, free, background, workers)
     columns = [slope]
     if nuisances:
         alone = renderer.render_views(views, workers=workers).phasor if background else image.phasor
@@ -205,7 +205,7 @@ def cramer_rao(
     if isinstance(pixels, str):
         use = use & counts(image.phasor, image.intensity, sensor)
     frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
-    rows = _whitened(image.phasor, image.intensity, np.concatenate(columns, axis=1), use, frames, on, sensor)
+    rows = whitened_slopes(image.phasor, image.intensity, np.concatenate(columns, axis=1), use, frames, on, sensor)
     everything = rows @ rows.transpose(0, 2, 1)
     information = eliminated(everything, len(free))
     common = None
@@ -215,7 +215,7 @@ def cramer_rao(
             common += declared_covariance(sensor, free)
         if terms := carried_errors(sensor, chosen):
             by_fields = calibrated_slopes(renderer, sensor, views, image, background, fields_of(terms), workers)
-            whitened = _whitened(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
+            whitened = whitened_slopes(image.phasor, image.intensity, by_fields, use, frames, on, sensor)
             # nuisances included: they take up part of an error
             known = np.nan_to_num(covariance_of(everything, weak_share=_WEAK_SHARE))
             p = len(free)
@@ -237,7 +237,7 @@ def _check_wall(nuisances: Sequence[str], background: Background | None) -> None
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
 
 
-def _image_and_slopes(
+def image_and_slopes(
     renderer: Renderer, views: Views, free: Sequence[str], background: Background | None, workers: int
 ) -> tuple[PhasorImages, NDArray[np.complex128]]:
     """Return the images of views and their slopes; height, with its kink at 0, is differenced."""
@@ -257,7 +257,7 @@ def _image_and_slopes(
     return image, np.stack([parts[name] for name in free], axis=1)
 
 
-def _whitened(
+def whitened_slopes(
     phasor: NDArray[np.complex128],
     intensity: NDArray[np.float64],
     slope: NDArray[np.complex128],

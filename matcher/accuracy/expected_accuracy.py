@@ -15,6 +15,7 @@ from phasemark import UsageError
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.accuracy.look_alikes import class_distances_squared
+from phasemark.matcher.accuracy.multipath import MultipathShift, multipath_shift
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.match import named_in_degrees
@@ -27,7 +28,7 @@ SOURCES = (EDGES, FACES, CALIBRATION, RECORDING, DECLARED)
 """What the variance of a pose comes from. An edge pixel is covered by the landmark in part."""
 _WEAK_SHARE = 1e-13
 _WHOLE = 1e-6  # of a pixel: coverage is exact but for rounding
-_SIDES = 12
+_SIDES, _SIDES_WITH_BOUNCES = 12, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +49,8 @@ class AccuracyCard:
         Union bound on the probability of a wrong class; NaN if there is no other class.
     others : tuple of str
         The classes that it is a bound for.
+    multipath : MultipathShift, optional
+        What light that bounces off a floor does where it is not modelled; None where that is not known.
     """
 
     views: Views
@@ -56,6 +59,7 @@ class AccuracyCard:
     parts: dict[str, NDArray[np.float64]]
     class_error: NDArray[np.float64]
     others: tuple[str, ...] = field(default=())
+    multipath: MultipathShift | None = None
 
     @property
     def covariance(self) -> NDArray[np.float64]:
@@ -112,6 +116,7 @@ class AccuracyCard:
         return (
             f"{self._where()}: {numbers} ({over}{unseen}){classes};"
             f" {self.dominant} dominates ({100 * shares[self.dominant or '']:.0f} % of the position's variance)"
+            f"{'' if self.multipath is None else f'; {self.multipath}'}"
         )
 
     def _where(self) -> str:
@@ -143,6 +148,7 @@ class AccuracyCard:
             "other_classes": list(self.others),
             "dominant": self.dominant,
             "shares": self.shares(),
+            "multipath": None if self.multipath is None else self.multipath.as_dict(),
         }
         return finite_or_none(facts)
 
@@ -179,7 +185,8 @@ def accuracy_card(
 
     Standard deviations are the Cramér–Rao bound on ranges (PHYSICS section 7), what the calibration of the sensor
     leaves, and what the sensor declares. With P the covariance of the noise and I_e the information of the edge pixels,
-    P I_e P is the contribution of the noise of edge pixels.
+    P I_e P is the contribution of the noise of edge pixels. Where the sensor says how wide its lamp shines, the
+    shift by light that bounces off a floor and is not modelled is told, for up to four of the views.
 
     Parameters
     ----------
@@ -234,7 +241,9 @@ def accuracy_card(
     if others:
         squares = class_distances_squared(renderer, views, others, n_frames=n_frames, background=background)
         error = np.minimum(confusion_probability(squares), 1.0)
-    return AccuracyCard(views, tuple(free), n_frames, parts, error, tuple(others))
+    few = views[:: max(len(views) // _SIDES_WITH_BOUNCES, 1)]  # light that bounces takes half a second a view
+    multipath = multipath_shift(renderer, few, free=free, background=background)
+    return AccuracyCard(views, tuple(free), n_frames, parts, error, tuple(others), multipath)
 
 
 def _median(values: NDArray[np.float64]) -> float:

@@ -203,6 +203,7 @@ class _Answers:
     n_mirrored: int = 0
     pose_time_s: Sequence[float] | None = None
     refused: tuple[int, FilteredFrames] | None = None
+    placed: Match | None = None
     table: Table | None = None
     """Its columns are those of the first match."""
 
@@ -257,6 +258,8 @@ class _Answers:
         if isinstance(batch.filtered, FilteredFrames):
             if index in self.plots:
                 self.drawn[index] = batch.filtered[k : k + 1], match
+            if self.placed is None and (match.accepted or match.reason == "poor fit"):
+                self.placed = match
             if self.refused is None and not match.accepted:
                 self.refused = index, batch.filtered[k : k + 1]
         return answer
@@ -287,6 +290,7 @@ class _Answers:
                 " looked for: build it over a wider range (bank info shows the range)"
             )
         inside = [d for d, reason in zip(self.distances_m, self.reasons, strict=True) if reason != _OUTSIDE]
+        self._note_multipath(matcher)
         for note in bank_ends(inside, matcher.bank.distance_m.tolist(), self.counted):
             tell(f"note: {note}")
         if self.n_mirrored:
@@ -294,6 +298,19 @@ class _Answers:
                 f"note: {self.n_mirrored} of {self._n_accepted} accepted answers may be those of images mirrored left"
                 " to right, which their landmarks do not show: check it once with something held to one side (--flip-h)"
             )
+
+    def _note_multipath(self, matcher: Matcher) -> None:
+        """Tell what light that bounces off a floor does to the first answer with a place, where it is not modelled."""
+        if self.placed is None:
+            return
+        from phasemark.matcher.accuracy.multipath import multipath_shift
+        from phasemark.render.view import VIEW_FIELDS, Views
+
+        match, views = self.placed, Views.broadcast(*(getattr(self.placed, name) for name in VIEW_FIELDS))
+        renderer = matcher.renderer(match.class_name or "")
+        shift = multipath_shift(renderer, views, free=match.free, background=match.background)
+        if shift is not None:
+            tell(f"note: {shift} (--bounces all models it)")
 
     @property
     def _n_accepted(self) -> int:

@@ -337,6 +337,9 @@ def wider(sensor: Sensor, size: float) -> Sensor:
     if size == 1.0:
         return sensor
     tan_h, tan_v = sensor.tan_half_angles
+    lamp_deg = sensor.lamp_half_angle_deg
     return sensor.with_(
-        half_angle_h_deg=math.degrees(math.atan(size * tan_h)), half_angle_v_deg=math.degrees(math.atan(size * tan_v))
+        half_angle_h_deg=math.degrees(math.atan(size * tan_h)),
+        half_angle_v_deg=math.degrees(math.atan(size * tan_v)),
+        lamp_half_angle_deg=None if lamp_deg is None else min(lamp_deg * max(size, 1.0), 180.0),
     )

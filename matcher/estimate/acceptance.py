@@ -21,7 +21,17 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background
 from phasemark.render.view import VIEW_FIELDS, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
-__all__ = ["TOLERATED_SIGMA", "Rules", "answer_of", "is_acceptable", "no_answer", "rank", "with_part", "with_parts"]
+__all__ = [
+    "TOLERATED_SIGMA",
+    "Rules",
+    "answer_of",
+    "is_acceptable",
+    "is_in_bank",
+    "no_answer",
+    "rank",
+    "with_part",
+    "with_parts",
+]
 
 TOLERATED_SIGMA = 3.0
 """Standard deviations that must lie within the tolerance of an accepted answer."""
@@ -118,7 +128,7 @@ def _is_determined(rules: Rules, std: NDArray[np.float64], symmetry: int) -> boo
 
 def is_acceptable(rules: Rules, fits: Fits, k: int) -> bool:
     """Return whether a fit would be accepted if nothing else explained its frame."""
-    if not fits.stands_out[k] or not fits.p_value[k] >= rules.false_alarm or not _is_in_bank(rules, fits, k):
+    if not fits.stands_out[k] or not fits.p_value[k] >= rules.false_alarm or not is_in_bank(rules, fits, k):
         return False
     if _explains_too_few(rules, fits, k):
         return False
@@ -130,7 +140,7 @@ def _explains_too_few(rules: Rules, fits: Fits, k: int) -> bool:
     return bool(fits.explained[k] < rules.fewest_explained)
 
 
-def _is_in_bank(rules: Rules, fits: Fits, k: int) -> bool:
+def is_in_bank(rules: Rules, fits: Fits, k: int) -> bool:
     """Return whether the view of a fit is in the range of the bank: beyond it no rival is looked for."""
     period = delta_period_rad(rules.symmetry[fits.class_index[k]])
     return is_in_range(rules.distance_m, rules.delta_rad, fits.view[k], period)
@@ -273,7 +283,7 @@ def _reason(rules: Rules, fits: Fits, kept: list[int], weights: Sequence[NDArray
     symmetry = rules.symmetry[fits.class_index[best]]
     if not _is_determined(rules, fits.std_without_one[best], symmetry):
         return "undetermined"
-    if not _is_in_bank(rules, fits, best):
+    if not is_in_bank(rules, fits, best):
         return "outside the bank"
     return "ambiguous" if _is_ambiguous(rules, fits, kept, weights) else ""
 

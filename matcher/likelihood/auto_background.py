@@ -24,6 +24,7 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.search import are_doubtful, fit_views, search_views
 from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.likelihood.valleys import with_valleys
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad
 
@@ -101,7 +102,8 @@ class AutoBackground:
         parts = []
         for which in _without_and_with(backgrounds):
             scene, some = self._scene(_standing(backgrounds, which)), self._evidence[which]
-            parts.append(_numbered(with_profiles(scene, some, _of_frames(fits, which)), which))
+            own = with_valleys(scene, some, _of_frames(fits, which))
+            parts.append(_numbered(with_profiles(scene, some, own), which))
         return backgrounds, Fits.joined(parts)
 
     @property

@@ -16,7 +16,7 @@ from phasemark.matcher.likelihood.contradictions import whole_cost
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, LONGEST_STEP, Problem, State, picked
 from phasemark.matcher.likelihood.residuals import Sums
-from phasemark.matcher.likelihood.uncertainty import capped_axes, view_covariance
+from phasemark.matcher.likelihood.uncertainty import capped_axes, step_of_others, view_covariance
 
 SETTLED_COST, ROUGH_COST = 1e-3, 0.1
 """A step that promises to lower the cost by less is not taken, and one that promised less than a hundred times as much
@@ -124,12 +124,8 @@ def look_beside(problem: Problem, state: State) -> State:
     theta[:, turn] += np.tile(sides, len(near))
     there = problem.some(source).turned(state, source, theta)
     d = int(np.flatnonzero(problem.columns == turn)[0])
-    others = np.flatnonzero(problem.columns != turn)
-    unit = problem.scale[others]
-    information = there.sums.information[:, others[:, None], others] * np.outer(unit, unit)
-    gradient = there.sums.gradient[:, others] * unit
-    step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
-    rise = (there.sums.cost - np.einsum("mp,mp->m", gradient, step)).reshape(len(near), -1)
+    step, gain = step_of_others(problem, there.sums, d)
+    rise = (there.sums.cost - gain).reshape(len(near), -1)
     rise -= state.sums.cost[near, None]
     # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum
     expected_rise = sides**2 / np.einsum("mpp->mp", view_covariance(problem, state))[near, d][:, None]
@@ -143,7 +139,7 @@ def look_beside(problem: Problem, state: State) -> State:
         return state
     which, at = near[chosen], chosen * len(sides) + best[chosen]
     theta = theta[at]
-    theta[:, problem.columns[others]] += step[at] * unit
+    theta[:, problem.columns] += step[at]
     theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], which)
     some = problem.some(which)
     found = descend(some, some.state(theta, state.use[which]), SETTLED_COST)

@@ -36,6 +36,7 @@ from phasemark.matcher.likelihood.shared_errors import with_motion, with_shared_
 from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.likelihood.systematic import Systematic
 from phasemark.matcher.likelihood.unknown_things import fit_without_borders
+from phasemark.matcher.likelihood.valleys import with_valleys
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.nearest.bank_minima import Search, Starts, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
@@ -171,6 +172,10 @@ class LikelihoodMatcher:
         """Rules by which an answer is accepted."""
         return self._setup.rules
 
+    def renderer(self, class_index: int) -> Renderer:
+        """Return what renders a class, with what it has computed of the light around it."""
+        return self._rendered.renderer(class_index)
+
     @property
     def is_quick(self) -> bool:
         """Whether a search renders nothing, for the images of the bank are fine enough."""
@@ -200,6 +205,7 @@ class LikelihoodMatcher:
         fits = refine(scene.final, evidence, starts, near_settings(scene, evidence))
         if setup.unknown and not setup.reports_one_surface:
             fits = fit_without_borders(scene, evidence, fits)
+        fits = with_valleys(scene, evidence, fits)
         bare = bare_cost(evidence.seen, scene.behind)
         (answer,) = rank(setup.rules, fits, self._doubt(fits), bare, [behind])
         return answer
@@ -226,7 +232,7 @@ class LikelihoodMatcher:
             floors = estimate_floors(self._setup, self._rendered, evidence, fits, self._stated)
             scene = replace(scene, final=self._rendered.with_background(*floors.backgrounds))
             fits = fit_before_floors(scene, evidence, fits)
-        fits = with_profiles(scene, evidence, fits)
+        fits = with_profiles(scene, evidence, with_valleys(scene, evidence, fits))
         backgrounds = [self._stated] * len(frames) if floors is None else floors.backgrounds
         answers = rank(self._setup.rules, fits, self._doubt(fits), bare, backgrounds)
         if floors is not None:

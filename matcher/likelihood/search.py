@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.matcher.chi_squared import largest_costs
-from phasemark.matcher.estimate.acceptance import is_acceptable
+from phasemark.matcher.estimate.acceptance import is_acceptable, is_in_bank
 from phasemark.matcher.estimate.fits import (
     BETTER_COST,
     MOST_REFINED,
@@ -30,6 +30,7 @@ from phasemark.matcher.likelihood.refine import Candidates, costs_at, refine, sl
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
 from phasemark.matcher.nearest.bank_minima import CostOf, Known, Search, Starts
+from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
@@ -83,8 +84,29 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
     poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), refused_p))
     if poor.size:
         fits = Fits.joined([fits, fit_neighbouring_views(scene, evidence, poor, fits)])
-    # 6  where the best fit would be accepted, look for rivals in all cells that are left
+    # 6  where nothing does yet, descend in every cell that may hold an explanation
+    if setup.bank.sensor.pixel_rad > WIDE_PIXEL_RAD and not (setup.unknown or setup.reports_one_surface):
+        fits = _in_all_cells(scene, evidence, seen, fits)
+    # 7  where the best fit would be accepted, look for rivals in all cells that are left
     return _with_rivals(scene, evidence, seen, fits)
+
+
+def _in_all_cells(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits) -> Fits:
+    """Return fits with those of all cells of frames that nothing explains yet.
+
+    In wide pixels the middle of the right cell may cost more than those beside it: it is no local minimum.
+    """
+    setup, n = scene.setup, len(evidence.weight)
+    which = np.flatnonzero(are_doubtful(setup, fits, n, setup.rules.false_alarm))
+    limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), _most(setup, evidence[which])
+    nothing = np.empty(0, np.int64), np.empty((0, len(VIEW)))
+    starts = scene.search.of_frames(which).uncovered(seen[which], limit, [nothing] * len(which))
+    for some in _in_parts(starts, len(which)):
+        found = fit_starts(scene, evidence, which[some], starts.of_frames(some), most[some])
+        # so near that no pixel is compared, or beyond the bank, anything fits
+        inside = [is_in_bank(setup.rules, found, k) for k in range(len(found))]
+        fits = Fits.joined([fits, found[np.array(inside, np.bool_)]])
+    return fits
 
 
 def _with_rivals(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits) -> Fits:

@@ -189,6 +189,7 @@ def _strip_sensor(sensor: Sensor, widest_columns: int) -> Sensor:
         hot_pixels=(),
         zone_offset_m=(),
         histogram=None,
+        lamp_half_angle_deg=None,  # it need not light what is beyond the image
     )
 
 

@@ -46,7 +46,7 @@ RECORDING_FIELDS = {
 _LENS_STEP_RAD = math.radians(0.02)
 """How far the width of a difference in a term of the lens moves the point of an image that it moves most."""
 _OFFSET = "range_offset_m"
-_BOUNCES = "floor_albedo"
+FLOOR_ALBEDO = "floor_albedo"
 SUPPOSED_ALBEDO = 0.5
 """Albedo of a floor below the landmark whose multipath is not modelled."""
 _LARGEST_ALBEDO = 0.6
@@ -159,7 +159,7 @@ def carried_errors(
         found["recording"] = Carried(tuple(std), np.diag(np.square(list(std.values()))))
     modelled = background is not None and background.bounces
     if "multipath" in terms and not modelled and sensor.lamp_half_angle_deg is not None and sensor.histogram is None:
-        found["multipath"] = Carried((_BOUNCES,), np.array([[_LARGEST_ALBEDO**2]]))
+        found["multipath"] = Carried((FLOOR_ALBEDO,), np.array([[_LARGEST_ALBEDO**2]]))
     return {name: one for name, one in found.items() if one.fields}
 
 
@@ -223,7 +223,7 @@ def calibrated_slopes(
         if name == _OFFSET:
             out[:, k] = by_range
             continue
-        if name == _BOUNCES:
+        if name == FLOOR_ALBEDO:
             floors = supposed_floors(renderer, views, background)
             direct = [None if own is None else replace(own, bounces=0) for own in floors]
             found, bare = (renderer.render_views(views, background=own, workers=workers) for own in (floors, direct))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
-from phasemark.matcher.likelihood.residuals import range_residuals, range_slopes, robust_weight
+from phasemark.matcher.likelihood.residuals import Sums, range_residuals, range_slopes, robust_weight
 
 _SLOPE_WIDTH = 0.05
 """Least half width, in natural units, over which final slopes are differenced, so that a kink narrower than this does
@@ -155,6 +155,18 @@ def slopes_along_axes(
     if not problem.with_albedo:
         return slope
     return np.concatenate([slope, state.images.slope[which, -1:]], axis=1)
+
+
+def step_of_others(problem: Problem, sums: Sums, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return Gauss–Newton's step of all parameters but one, (m, p), and what the cost promises to fall by, (m,)."""
+    others = np.flatnonzero(np.arange(len(problem.columns)) != d)
+    unit = problem.scale[others]
+    information = sums.information[:, others[:, None], others] * np.outer(unit, unit)
+    gradient = sums.gradient[:, others] * unit
+    step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
+    whole = np.zeros_like(sums.gradient)
+    whole[:, others] = step * unit
+    return whole, np.einsum("mp,mp->m", gradient, step)
 
 
 def std_without_one_pixel(problem: Problem, state: State, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
