@@ -33,11 +33,14 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
 
     Distance, δ and bearing are moved by four standard deviations to both sides, alone and with the others. Where the
     cost rises by less than half of what is expected, the second moment of the profile likelihood along its valley is
-    added. Where pixels are narrow enough for slopes to hold, nothing is done.
+    added. Nothing is done where pixels are narrow enough for slopes to hold, nor with a robust loss: that is flat far
+    away, and its jackknife asks no slope to hold there.
     """
+    if scene.setup.huber is not None or scene.setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD:
+        return fits
     best = best_of_frame(fits)
     best = best[[is_acceptable(scene.setup.rules, fits, int(k)) for k in best]]
-    if not best.size or scene.setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD:
+    if not best.size:
         return fits
     own = fits[best]
     problem = Problem(scene.final, evidence, own.frame, own.class_index, scene.settings())
