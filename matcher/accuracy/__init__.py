@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability
     from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
+    from phasemark.matcher.accuracy.multipath import MultipathShift, multipath_shift
     from phasemark.matcher.accuracy.pose_errors import PoseReport, pose_report
     from phasemark.matcher.accuracy.strangers import StrangerRate, stranger_rates
     from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
@@ -18,6 +19,7 @@ __all__ = [
     "AccuracyCard",
     "Bound",
     "GridLoss",
+    "MultipathShift",
     "PoseReport",
     "SpacingLoss",
     "StrangerRate",
@@ -27,6 +29,7 @@ __all__ = [
     "accuracy_card",
     "confusion_probability",
     "grid_loss",
+    "multipath_shift",
     "pose_report",
     "run_trials",
     "sides_of",

@@ -1,4 +1,4 @@
-"""How far off an estimate is where light bounces off a floor and the model has it not."""
+"""The shift of an estimate by light that bounces off a floor, where the model has it not."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _SYMBOLS = dict(zip(VIEW, ("D", "δ", "bearing", "height", "pitch", "roll"), str
 
 @dataclass(frozen=True, eq=False)
 class MultipathShift:
-    """By how much light that bounces off a floor moves an estimate whose model has it not.
+    """The shift of an estimate by light that bounces off a floor, where the model has it not.
 
     Parameters
     ----------

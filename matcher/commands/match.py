@@ -301,9 +301,9 @@ class _Answers:
 
     def _note_multipath(self, matcher: Matcher) -> None:
         """Tell what light that bounces off a floor does to the first answer with a place, where it is not modelled."""
-        if self.placed is None:
+        if self.placed is None or matcher.bank.sensor.lamp_half_angle_deg is None:
             return
-        from phasemark.matcher.accuracy.multipath import multipath_shift
+        from phasemark.matcher.accuracy import multipath_shift
         from phasemark.render.view import VIEW_FIELDS, Views
 
         match, views = self.placed, Views.broadcast(*(getattr(self.placed, name) for name in VIEW_FIELDS))
