@@ -157,16 +157,15 @@ def slopes_along_axes(
     return np.concatenate([slope, state.images.slope[which, -1:]], axis=1)
 
 
-def step_of_others(problem: Problem, sums: Sums, d: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Gauss–Newton's step of all parameters but one, (m, p), and what the cost promises to fall by, (m,)."""
-    others = np.flatnonzero(np.arange(len(problem.columns)) != d)
-    unit = problem.scale[others]
-    information = sums.information[:, others[:, None], others] * np.outer(unit, unit)
-    gradient = sums.gradient[:, others] * unit
+def step_of_others(
+    problem: Problem, sums: Sums, held: NDArray[np.integer]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return Gauss–Newton's steps with one parameter of each held, (m, p), and what costs promise to fall by, (m,)."""
+    row, unit = np.arange(len(held)), problem.scale
+    information, gradient = sums.information * np.outer(unit, unit), sums.gradient * unit
+    information[row, held], information[row, :, held], gradient[row, held] = 0.0, 0.0, 0.0
     step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
-    whole = np.zeros_like(sums.gradient)
-    whole[:, others] = step * unit
-    return whole, np.einsum("mp,mp->m", gradient, step)
+    return step * unit, np.einsum("mp,mp->m", gradient, step)
 
 
 def std_without_one_pixel(problem: Problem, state: State, covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -78,15 +78,14 @@ def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float6
     n = ways.shape[1] * ways.shape[2]
     rise = _rise_at(problem, state, np.repeat(known, n), ways.reshape(-1, ways.shape[3]))[0].reshape(expected.shape)
     doubtful = (rise < _DOUBTFUL_SHARE * expected).any(axis=1)
-    for k, d in enumerate(own.tolist()):
-        some = known[doubtful[:, k]]
-        if not some.size:
-            continue
-        moment = _valley(problem, state, some, d, along[doubtful[:, k], k])[:, :p, :p]
-        # what is left of the others where this parameter is known, and the valley
-        column, variance = wide[some][:, :, d], wide[some][:, d, d, None, None]
-        rest = wide[some] - column[:, :, None] * column[:, None, :] / variance
-        wide[some] = np.where(moment[:, d, d, None, None] > variance, rest + moment, wide[some])
+    row, k = np.nonzero(doubtful)
+    if not row.size:
+        return wide
+    moments = _valley(problem, state, known[row], own[k], along[row, k])[:, :p, :p]
+    for solution, d, moment in zip(known[row], own[k], moments, strict=True):
+        one = wide[solution]
+        if moment[d, d] > one[d, d]:  # what is left of the others where this parameter is known, and the valley
+            wide[solution] = one - np.outer(one[:, d], one[:, d]) / one[d, d] + moment
     return wide
 
 
@@ -112,21 +111,22 @@ def _rise_at(
 
 
 def _valley(
-    problem: Problem, state: State, which: NDArray[np.integer], d: int, std: NDArray[np.float64]
+    problem: Problem, state: State, which: NDArray[np.integer], d: NDArray[np.integer], std: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return second moments of the profile likelihood of parameter `d` about some solutions, (k, P, P)."""
+    """Return second moments of the profile likelihood of a parameter each, `d`, about some solutions, (k, P, P)."""
     least, rounds, farthest_root = 2.0, 5, 5.0  # standard deviations as stated, and as the cost has them
     fine = np.linspace(0.0, 1.0, 9)[1:]
-    both, std = np.repeat(which, 2), np.repeat(std, 2, axis=0)
+    both, d, std = np.repeat(which, 2), np.repeat(d, 2), np.repeat(std, 2, axis=0)
     moment, mass = np.zeros((*std.shape, std.shape[1])), np.zeros(len(both))
     move, root, step = np.zeros_like(std), np.zeros(len(both)), least * std * np.tile([[-1.0], [1.0]], (len(which), 1))
     on = np.arange(len(both))
     for _ in range(rounds):
-        rise, farther = _rise_beside(problem, state, both[on], d, step[on])
+        rise, farther = _rise_beside(problem, state, both[on], d[on], step[on])
         there = np.sqrt(np.minimum(rise, 1e6))
+        length = np.abs(farther - move[on])[np.arange(len(on)), d[on]]
         # the root of the cost and the others change in proportion between two offsets
         for share in fine:
-            weight = np.exp(-((root[on] + share * (there - root[on])) ** 2) / 2) * np.abs(farther - move[on])[:, d]
+            weight = np.exp(-((root[on] + share * (there - root[on])) ** 2) / 2) * length
             at = move[on] + share * (farther - move[on])
             moment[on] += weight[:, None, None] * at[:, :, None] * at[:, None, :]
             mass[on] += weight
@@ -139,16 +139,16 @@ def _valley(
 
 
 def _rise_beside(
-    problem: Problem, state: State, which: NDArray[np.integer], d: int, move: NDArray[np.float64]
+    problem: Problem, state: State, which: NDArray[np.integer], d: NDArray[np.integer], move: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how much more some solutions cost after a move, (k,), and the move (k, P) with which that is least.
 
     All parameters but `d` follow by one Gauss–Newton step there, or hardly, as across a kink.
     """
-    ways = np.concatenate([move, np.where(np.arange(move.shape[1]) == d, move, 0.0)])
+    ways = np.concatenate([move, np.where(np.arange(move.shape[1]) == d[:, None], move, 0.0)])
     twice = np.tile(which, 2)
     rise, there = _rise_at(problem, state, twice, ways, with_slopes=True)
-    stepped = ways + step_of_others(problem, there.sums, d)[0]
+    stepped = ways + step_of_others(problem, there.sums, np.tile(d, 2))[0]
     rises = np.concatenate([rise, _rise_at(problem, state, twice, stepped)[0]]).reshape(4, -1)
     moves = np.concatenate([ways, stepped]).reshape(4, *move.shape)
     return rises.min(axis=0), moves[rises.argmin(axis=0), np.arange(len(which))]
