@@ -229,6 +229,7 @@ def test_covariances_hold_where_an_edge_reaches_a_border_of_wide_pixels():
     inside = int((squared < chi2.ppf(0.95, p)).sum())
     assert inside >= binom.ppf(0.002, len(squared), 0.95)
     assert squared.max() < chi2.isf(1e-3 / len(squared), p)
+    assert np.median(squared) > chi2.ppf(0.3, p)  # they claim no less than is known either
 
 
 def test_the_right_view_is_found_where_its_cell_is_no_local_minimum():

@@ -213,8 +213,7 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     unexplained = pixels.unexplained.sum(axis=1)
     tested = cost - prior - DISAGREEMENT * unexplained
     p = len(settings.free)
-    unit = np.outer(problem.scale, problem.scale)[:p, :p]
-    information = covariance_of(covariance / unit) / unit  # the inverse of a covariance is information
+    information = covariance_of(covariance, 1 / problem.scale[:p])  # the inverse of a covariance is information
     return Fits(
         frame=problem.frame,
         class_index=problem.class_index,

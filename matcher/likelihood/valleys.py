@@ -32,9 +32,9 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Return fits with covariances as wide as the likelihood is; only the best of each frame, if it would be accepted.
 
     Distance, δ and bearing are moved by four standard deviations to both sides, alone and with the others. Where the
-    cost rises by less than half of what is expected, the second moment of the profile likelihood along its valley is
-    added. Nothing is done where pixels are narrow enough for slopes to hold, nor with a robust loss: that is flat far
-    away, and its jackknife asks no slope to hold there.
+    cost rises by less than half of what is expected, the part of that parameter is the second moment of its profile
+    likelihood, along the valley. Nothing is done where pixels are narrow enough for slopes to hold, nor with a robust
+    loss, which is flat far away by design.
     """
     if scene.setup.huber is not None or scene.setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD:
         return fits
@@ -49,9 +49,7 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     covariance, std, information = fits.covariance.copy(), fits.std_without_one.copy(), fits.information.copy()
     covariance[best] = wide
     std[best] *= np.sqrt(np.einsum("mpp->mp", wide) / np.einsum("mpp->mp", own.covariance))
-    p = covariance.shape[1]
-    unit = np.outer(problem.scale, problem.scale)[:p, :p]
-    information[best] = covariance_of(wide / unit) / unit
+    information[best] = covariance_of(wide, 1 / problem.scale[: wide.shape[1]])  # the inverse of a covariance
     return replace(fits, covariance=covariance, std_without_one=std, information=information)
 
 
@@ -62,8 +60,7 @@ def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float6
     if not known.size:
         return wide
     own = np.flatnonzero(problem.columns <= VIEW.index("bearing_rad"))
-    unit = np.outer(problem.scale, problem.scale)[:p, :p]
-    information, spread = covariance_of(covariance[known] / unit) / unit, covariance[known][:, own]
+    information, spread = covariance_of(covariance[known], 1 / problem.scale[:p]), covariance[known][:, own]
     along = spread / np.sqrt(spread[:, np.arange(len(own)), own])[..., None]
     alone = along * (np.arange(p) == own[:, None])
     ways = _ASKED_SIGMA * np.stack([along, alone, -along, -alone], axis=1)  # (k, 4, parameters moved, p)
