@@ -320,11 +320,25 @@ class Matcher:
         return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
 
     def renderer(self, class_name: str) -> Renderer:
-        """Return what renders a landmark of the bank, with what matching has computed of the light around it."""
+        """Return what renders a landmark of the bank, with what matching has computed of the light around it.
+
+        Parameters
+        ----------
+        class_name : str
+
+        Returns
+        -------
+        Renderer
+
+        Raises
+        ------
+        UsageError
+            The bank does not have the class.
+        """
+        mesh = self.bank.mesh(class_name)
         own = self._by_evidence[0] if self._by_evidence else self
         if own.method == "refine" and isinstance(own._method, LikelihoodMatcher):
             return own._method.renderer(self.bank.classes.index(class_name))
-        mesh = self.bank.mesh(class_name)
         return Renderer(mesh, self.bank.sensor, albedo=float(mesh.metadata["albedo"]))
 
     @property

@@ -13,9 +13,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.cli import main
 from phasemark.data import Bank, build_bank
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.accuracy.multipath import multipath_shift
+from phasemark.matcher.accuracy import accuracy_card, multipath_shift
 from phasemark.matcher.diagnosis.search import wider
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture, preset
 from phasemark.render.bounces import standing
@@ -24,6 +25,7 @@ GOLDEN = Path(__file__).parent / "golden" / "multipath.npz"
 BEHIND = Background(wall_m=2.2, floor_m=0.15, wall_albedo=0.4, floor_albedo=0.5)
 """Of the scene "box"; the box's albedo is 0.8."""
 N = 3
+METRES = "--unit", "m", "--quantity", "range"
 
 
 @pytest.fixture(scope="module")
@@ -106,6 +108,27 @@ def test_the_shift_that_is_told_is_that_of_foreign_frames(
     ]
     assert told.shift[0] == pytest.approx(np.mean(errors), rel=0.15)
     assert str(told).startswith("multipath is off: a floor of albedo 0.5, 0.15 m below the lens, moves D by +")
+
+
+def test_accuracy_and_match_tell_the_shift(
+    known: dict[str, Any], renderer: Renderer, bank: Bank, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = Views.broadcast(1.0)
+    told = multipath_shift(renderer, view)
+    assert told is not None
+    card = accuracy_card(renderer, view)
+    assert card.line().endswith(f"; {told}")
+    assert card.as_dict()["multipath"]["shift"]["distance_m"] == pytest.approx(told.shift[0])
+    frames = capture(
+        _frames(known, renderer.render(1.0, background=BEHIND)), bank.sensor, n_frames=50, rng=np.random.default_rng(0)
+    )
+    np.save(tmp_path / "frames.npy", frames.range_m[0])
+    assert (
+        main(["match", str(bank.path), str(tmp_path / "frames.npy"), "--unknown-background", "--no-diagnosis", *METRES])
+        == 0
+    )
+    note = capsys.readouterr().err
+    assert "note: multipath is off: a floor of albedo 0.5, 0.15 m below the lens, moves D by +" in note
 
 
 def test_nothing_is_told_of_multipath_that_is_modelled_or_of_an_unknown_lamp(renderer: Renderer, mesh: Any) -> None:

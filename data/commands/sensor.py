@@ -95,7 +95,9 @@ def sensor_show(
     else:
         scales = ", ".join(f"{camera.metres_per_radian:.6f}" for camera in sensor.by_frequency)
         echo(f"# unambiguous range {sensor.unambiguous_range_m:.4f} m, {scales} m per radian")
-        if sensor.lamp_half_angle_deg is None:
+        if len(sensor.frequencies_hz) > 1:
+            echo("# multipath is not told: that takes one modulation frequency")
+        elif sensor.lamp_half_angle_deg is None:
             echo("# multipath is not told: set lamp_half_angle_deg, how far off the axis the lamp shines")
         else:
             echo("# multipath that is not modelled is told by match and accuracy, and is in the covariance of answers")

@@ -241,7 +241,7 @@ def accuracy_card(
     if others:
         squares = class_distances_squared(renderer, views, others, n_frames=n_frames, background=background)
         error = np.minimum(confusion_probability(squares), 1.0)
-    few = views[:: max(len(views) // _SIDES_WITH_BOUNCES, 1)]  # light that bounces takes half a second a view
+    few = views[:: math.ceil(len(views) / _SIDES_WITH_BOUNCES)]  # light that bounces takes half a second a view
     multipath = multipath_shift(renderer, few, free=free, background=background)
     return AccuracyCard(views, tuple(free), n_frames, parts, error, tuple(others), multipath)
 

@@ -110,9 +110,9 @@ def multipath_shift(
     )
     inverse = covariance_of(rows @ rows.transpose(0, 2, 1))
     shift = (inverse @ (rows @ extra.transpose(0, 2, 1)))[:, :, 0]
-    told = [k for k, floor in enumerate(floors) if floor is not None and np.isfinite(shift[k]).all()]
-    if not told:
-        return None
-    most = max(told, key=lambda k: abs(float(shift[k, 0])))
-    floor_m = getattr(floors[most], "floor_m", math.nan)
-    return MultipathShift(albedo, float(floor_m), tuple(free), shift[most])
+    told = [
+        MultipathShift(albedo, floor.floor_m, tuple(free), own)
+        for floor, own in zip(floors, shift, strict=True)
+        if floor is not None and floor.floor_m is not None and np.isfinite(own).all()
+    ]
+    return max(told, key=lambda one: abs(float(one.shift[0])), default=None)
