@@ -301,7 +301,8 @@ class _Answers:
 
     def _note_multipath(self, matcher: Matcher) -> None:
         """Tell what light that bounces off a floor does to the first answer with a place, where it is not modelled."""
-        if self.placed is None or matcher.bank.sensor.lamp_half_angle_deg is None:
+        sensor = matcher.bank.sensor
+        if self.placed is None or sensor.lamp_half_angle_deg is None or len(sensor.frequencies_hz) > 1:
             return
         from phasemark.matcher.accuracy import multipath_shift
         from phasemark.render.view import VIEW_FIELDS, Views
