@@ -5,10 +5,12 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.matcher.live.session import Live, Update
-    from phasemark.matcher.live.sinks import Sink, open_sink
-    from phasemark.matcher.live.sources import Source, open_source
+    from phasemark.matcher.live.openers import open_sink, open_source
+    from phasemark.matcher.live.session import Live
+    from phasemark.matcher.live.sinks import Sink
+    from phasemark.matcher.live.sources import Source
     from phasemark.matcher.live.tracker import Locator, Tracker
+    from phasemark.matcher.live.updates import Update
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 

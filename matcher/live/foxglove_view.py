@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
 
 from phasemark import UsageError
 from phasemark.matcher.live.extras import needed
-from phasemark.matcher.live.sinks import Sink, as_dict, plain_rows
-
-if TYPE_CHECKING:
-    from phasemark.matcher.live.session import Update
-    from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.sinks import Sink
+from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.updates import Update, plain_rows
 
 
 class FoxgloveSink(Sink):
@@ -51,7 +48,7 @@ class FoxgloveSink(Sink):
     def update(self, update: Update) -> None:
         """Send a pose, if it is accepted, and what is known."""
         found, now = update.located.estimate, int(update.time_s * 1e9)
-        self._update.log(as_dict(update), log_time=now)
+        self._update.log(update.as_dict(), log_time=now)
         self._zones.log({"range_m": plain_rows(update.zones_m)}, log_time=now)
         if not update.reason and found.pose is not None:
             own, heading = self._messages, float(found.pose[2])

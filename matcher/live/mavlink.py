@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.matcher.live.extras import needed
 from phasemark.matcher.live.sinks import Sink, planar_covariance
-
-if TYPE_CHECKING:
-    from phasemark.matcher.live.session import Update
+from phasemark.matcher.live.updates import Update
 
 _SYSTEM, _VISUAL_INERTIAL = 1, 197
 """System that the messages come from, and the component MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""

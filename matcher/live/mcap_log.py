@@ -6,19 +6,17 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 
 from phasemark import InputFileError
 from phasemark.matcher.live.extras import needed
-from phasemark.matcher.live.sinks import Sink, as_dict, open_output, plain_rows
+from phasemark.matcher.live.sinks import Sink, open_output
 from phasemark.matcher.live.sources import Replay
+from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.updates import Update, plain_rows
 from phasemark.render import Frames, Sensor
-
-if TYPE_CHECKING:
-    from phasemark.matcher.live.session import Update
-    from phasemark.matcher.live.status import Status
 
 _TOPICS = ("frames", "matches", "poses", "status")
 _LIBRARY = "phasemark"
@@ -55,7 +53,7 @@ class McapSink(Sink):
         self._write("frames", update, {"index": update.number, **_frame_dict(cast(Frames, update.frames))})
         match = {} if located.match is None else located.match.as_dict()
         self._write("matches", update, {"index": update.number, "searched": located.searched, **match})
-        self._write("poses", update, as_dict(update))
+        self._write("poses", update, update.as_dict())
 
     def status(self, status: Status) -> None:
         """Write the status."""

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import Bank
-from phasemark.matcher.live.session import Update
-from phasemark.matcher.live.sinks import as_dict, plain_rows
+from phasemark.matcher.live.updates import Update, plain_rows
 from phasemark.matcher.position.robot_pose import PRIOR_STD
 from phasemark.render import Renderer, Views
 from phasemark.render.phasor_images import wrap_difference_m
@@ -36,7 +35,11 @@ class Pictures:
 
     def of(self, update: Update) -> dict[str, Any]:
         """Return zones and residuals, rows from the top, None where there is none, and the pose as JSON has it."""
-        found: dict[str, Any] = {**as_dict(update), "range_m": plain_rows(update.zones_m.round(4)), "residual_mm": None}
+        found: dict[str, Any] = {
+            **update.as_dict(),
+            "range_m": plain_rows(update.zones_m.round(4)),
+            "residual_mm": None,
+        }
         found["poses"] = [[round(share, 4), *pose.round(4).tolist()] for share, pose in update.located.estimate.poses]
         if not update.reason:
             found["std"] = np.sqrt(np.diag(found["covariance"])).tolist()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,8 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.matcher.live.extras import needed
 from phasemark.matcher.live.sinks import Sink, planar_covariance
-
-if TYPE_CHECKING:
-    from phasemark.matcher.live.session import Update
-    from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.updates import Update
 
 _DEPTH = 10
 

@@ -7,17 +7,12 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
 
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.sources import Arrival, Source, SourceFault
 from phasemark.matcher.live.status import Status
-from phasemark.matcher.live.tracker import Located, Locator
-from phasemark.matcher.locate.recording import RigRecording
-from phasemark.render import Frames
+from phasemark.matcher.live.tracker import Locator
+from phasemark.matcher.live.updates import Update
 
 _RETRY_S = 0.2
 """Pause before a source is opened again."""
@@ -25,46 +20,6 @@ _SETTLES = 5
 """Frames whose stamps have to run forward after a jump before a pose is published: two boards on a port never do."""
 _DRIFT = 1e-4
 """By how much the source's clock may run slow against ours, seconds a second."""
-
-
-@dataclass(frozen=True, eq=False)
-class Update:
-    """Outcome of one frame.
-
-    Parameters
-    ----------
-    number : int
-        Of the frame, from 0.
-    frames : Frames or RigRecording
-        The frame.
-    stamp_s : float
-        Its stamp on the source's clock; when it arrived where the source has none.
-    pose_stamp_s : float
-        Time of the pose on that clock: the stamp with the sensor's delay.
-    time_s : float
-        Time of the pose on our clock, seconds since 1970; of a recording the same as `pose_stamp_s`.
-    located : Located
-        What was found.
-    reason : str
-        Why the pose is not published; empty where it is.
-    latency_s : float
-        From the last byte of the frame to this.
-    """
-
-    number: int
-    frames: Frames | RigRecording
-    stamp_s: float
-    pose_stamp_s: float
-    time_s: float
-    located: Located
-    reason: str
-    latency_s: float
-
-    @property
-    def zones_m(self) -> NDArray[np.float64]:
-        """Ranges as a grid, or a row for each sensor of a rig."""
-        own = self.frames
-        return np.asarray(own.range_m[0, 0] if isinstance(own, Frames) else own.depth_m[0, -1])
 
 
 class Live:

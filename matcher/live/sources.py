@@ -15,14 +15,14 @@ from typing import Any, cast
 
 import numpy as np
 
-from phasemark import InputFileError, UsageError
+from phasemark import InputFileError
 from phasemark.data.measured import board_prints as prints
 from phasemark.data.measured.boards import BOARDS, Board, find_board, recording_of
 from phasemark.data.measured.csv_frames import parse_csv
 from phasemark.data.measured.reading import frames_of, read_frames, shape_before
 from phasemark.data.measured.recording import Recording
 from phasemark.matcher.live.extras import needed
-from phasemark.matcher.live.streams import Lines, Stream, address_of, open_stream
+from phasemark.matcher.live.streams import Lines, Stream, address_of
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.render import Frames, Sensor
 
@@ -365,45 +365,6 @@ class RecordedSource(Replay):
         stamps, period_s = self._recorded.time_s, 1 / (self._recorded.sensor.frame_rate_hz or 15.0)
         for k in range(len(self._recorded)):
             yield self._recorded[k : k + 1], k * period_s if stamps is None else float(stamps[k, 0])
-
-
-def open_source(name: str, sensor: Sensor, how: Mapping[str, Any] | None = None, *, in_time: bool = True) -> Source:
-    """Return the source that a name stands for.
-
-    Parameters
-    ----------
-    name : str
-        ``/dev/ttyUSB0``, ``serial:///dev/ttyUSB0?baud=921600``, ``-`` (standard input), ``tcp://host:port``,
-        ``udp://:port``, ``zmq://host:port`` (TMF8829), a recording, or a log in MCAP that a sink wrote.
-    sensor : Sensor
-        The camera.
-    how : mapping, optional
-        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean, `board` among them.
-    in_time : bool
-        Whether frames of a recording come in the rhythm of their stamps.
-
-    Raises
-    ------
-    UsageError
-        There is no source of this name, or a package is missing.
-    InputFileError
-        A recording cannot be read.
-    """
-    how = how or {}
-    if how.get("board") is not None and how["board"] not in BOARDS:
-        raise UsageError(f"board=… must be one of {', '.join(BOARDS)}, got {how['board']!r}")
-    stream = open_stream(name)
-    if stream is not None:
-        return PrintedSource(stream, sensor, how)
-    if name.startswith("zmq://"):
-        return Tmf8829Source(name, sensor, how)
-    if "://" in name:
-        raise UsageError(f"{name}: a source must begin with serial://, tcp://, udp:// or zmq://, or be a file")
-    if Path(name).suffix == ".mcap":
-        from phasemark.matcher.live.mcap_log import McapSource
-
-        return McapSource(Path(name), sensor, in_time=in_time)
-    return RecordedSource(Path(name), sensor, how, in_time=in_time)
 
 
 def _reason(error: OSError) -> str:

@@ -13,9 +13,9 @@ from rich.text import Text
 
 from phasemark.data import Bank
 from phasemark.matcher.live.picture import Pictures
-from phasemark.matcher.live.session import Update
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.status import Status
+from phasemark.matcher.live.updates import Update
 
 _EVERY_S = 0.2
 """Time between two pictures: each renders the landmark once."""
