@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ _TURN = 0.35
 """Largest extent of the normals within a patch."""
 _THIN, _SHORTER = 0.25, 0.4
 """Triangles lower than this share of their length are cut shorter, for their centroids to say where they are."""
-_EVEN = 1 + 1e-9
+_EVEN = 1 + 1e-6
 """Rounding of areas that are the same."""
 _DEEP = 0.2
 """Largest extent of a patch across its first facet, in sizes of the patch: surfaces in two planes are not joined."""
@@ -284,6 +285,38 @@ def _has_something_before(facets: Facets, topology: MeshTopology, lift: float) -
     return np.column_stack([heights.max(axis=1) > 2 * lift, behind])
 
 
+class _Runs:
+    """Runs of rows of arrays, one for each group.
+
+    Parameters
+    ----------
+    group : (m,) int64
+        Groups of the rows, in ascending order.
+    """
+
+    def __init__(self, group: NDArray[np.int64]) -> None:
+        begins = np.diff(group, prepend=-1) != 0
+        self.first, self.of = np.flatnonzero(begins), np.cumsum(begins) - 1
+        self.length = np.diff(self.first, append=len(group))
+
+    def sum(self, values: NDArray[Any]) -> NDArray[np.float64]:
+        """Return the sum of each run."""
+        return np.asarray(np.add.reduceat(values.astype(np.float64), self.first))
+
+    def low(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the least value of each run."""
+        return np.asarray(np.minimum.reduceat(values, self.first))
+
+    def extent(self, *values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the extent of each run, of one array of values or of several that lie in the same rows."""
+        low, high = np.minimum.reduce(values), np.maximum.reduce(values)
+        return np.asarray(np.maximum.reduceat(high, self.first) - self.low(low))
+
+    def least(self, values: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return the first row of each run that has its least value."""
+        return np.lexsort((values, self.of))[self.first]
+
+
 def _joined(
     facets: Facets,
     useful: NDArray[np.bool_],
@@ -295,141 +328,140 @@ def _joined(
     """Join facets into patches no larger than `sizes`, (f,); `useful`, (f, 2), says which sides are wanted."""
     centres, albedo = facets.corners.mean(axis=1), topology.albedo[facets.face]
     body = topology.part[facets.face]
-    leaves, sides = [], []
-    for side in range(2):
-        for b in np.unique(body[useful[:, side]]):
-            own = np.flatnonzero(useful[:, side] & (body == b))
-            for value in np.unique(albedo[own]):
-                found = _grouped(own[albedo[own] == value], facets, centres, sizes)
-                leaves += found
-                sides += [side] * len(found)
+    side, members = np.nonzero(useful.T)
+    _, kind = np.unique(np.column_stack([side, body[members], albedo[members]]), axis=0, return_inverse=True)
+    own = _grouped(members, kind.ravel(), facets, centres, sizes)
     patch_of = np.full((len(facets.face), 2), -1)
-    for k, (leaf, side) in enumerate(zip(leaves, sides, strict=True)):
-        patch_of[leaf, side] = k
-    sign = 1.0 - 2.0 * np.array(sides)
-    first = np.cumsum([0, *(len(leaf) for leaf in leaves)])
-    members = np.concatenate(leaves)
-    area = np.add.reduceat(facets.areas[members], first[:-1])
-    normal = np.add.reduceat(facets.areas[members, None] * facets.normals[members], first[:-1])
-    normal *= (sign / area)[:, None]
-    centre = np.add.reduceat(facets.areas[members, None] * centres[members], first[:-1]) / area[:, None]
-    outlook = centre.copy()
-    points, normals = np.empty((2, len(leaves), POINTS, 3))
-    weights, size = np.empty((len(leaves), POINTS)), np.empty(len(leaves))
-    for k, leaf in enumerate(leaves):
-        points[k], weights[k], normals[k] = _points_of(leaf, facets)
-        size[k] = np.linalg.norm(np.ptp(facets.corners[leaf].reshape(-1, 3), axis=0))
-        if np.linalg.norm(normal[k]) < 1 - 1e-9:
-            outlook[k] = centres[leaf[np.argmin(((centres[leaf] - centre[k]) ** 2).sum(axis=1))]]
-        else:
-            points[k] = _spread_as(facets, leaf, centre[k], points[k], weights[k])
-    corners = facets.corners.reshape(-1, 3)
+    patch_of[members, side] = own
+    order = np.argsort(own, kind="stable")
+    members, side, runs = members[order], side[order], _Runs(own[order])
+    sign = 1.0 - 2.0 * side[runs.first]
+    areas, corners = facets.areas[members], facets.corners[members]
+    area = runs.sum(areas)
+    normal = runs.sum(areas[:, None] * facets.normals[members]) * (sign / area)[:, None]
+    centre = runs.sum(areas[:, None] * centres[members]) / area[:, None]
+    points, weights, normals = _points_of(members, runs, facets)
+    flat = np.linalg.norm(normal, axis=1) >= 1 - 1e-9
+    points = np.where(flat[:, None, None], _spread(facets, members, runs, centre, points, weights), points)
+    nearest = members[runs.least(((centres[members] - centre[runs.of]) ** 2).sum(axis=1))]
+    whole = facets.corners.reshape(-1, 3)
     return Patches(
         facets,
         members,
-        first,
-        sign,
+        np.append(runs.first, len(members)),
+        np.asarray(sign),
         _nearest_patch(patch_of, facets, centres, centre, body),
         points,
         normals * sign[:, None, None],
         weights,
         centre,
         normal,
-        outlook,
+        np.where(flat[:, None], centre, centres[nearest]),
         area,
-        size,
-        albedo[members[first[:-1]]],
-        body[members[first[:-1]]],
-        make_intersector(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), intersector),
+        np.asarray(np.linalg.norm(runs.extent(*corners.transpose(1, 0, 2)), axis=1), np.float64),
+        albedo[members[runs.first]],
+        body[members[runs.first]],
+        make_intersector(whole, np.arange(len(whole), dtype=np.int32).reshape(-1, 3), intersector),
         lift,
     )  # fmt: skip
 
 
 def _grouped(
-    facets_of: NDArray[np.int64],
+    own: NDArray[np.int64],
+    group: NDArray[np.int64],
     facets: Facets,
     centres: NDArray[np.float64],
     sizes: NDArray[np.float64],
-) -> list[NDArray[np.int64]]:
-    """Halve a set of facets in space, or by their normals, until each is as small and as flat as a patch may be."""
-    leaves, waiting = [], [facets_of]
-    while waiting:
-        own = waiting.pop()
-        extent = np.ptp(facets.corners[own].reshape(-1, 3), axis=0)
-        turn = np.ptp(facets.normals[own], axis=0)
-        size = sizes[own].min()
-        heights = centres[own] @ facets.normals[own[0]]
-        depth = np.ptp(heights)
-        bounds = [np.linalg.norm(extent) / size, np.linalg.norm(turn) / _TURN, depth / (_DEEP * size)]
-        if len(own) == 1 or max(bounds) <= 1:
-            leaves.append(own)
-            continue
-        along = np.concatenate([extent / size, turn / _TURN, [depth / (_DEEP * size)]])
-        values = np.column_stack([centres[own], facets.normals[own], heights])[:, np.argmax(along)]
-        low = values < 0.5 * (values.min() + values.max())
-        if not low.any() or low.all():  # all in one place: a large facet beside small ones
-            leaves += [own[[k]] for k in range(len(own))]
-            continue
-        waiting += [own[low], own[~low]]
-    return leaves
+) -> NDArray[np.int64]:
+    """Halve groups of facets in space, or by their normals, until each is as small and as flat as a patch may be.
+
+    Return the patch of each facet `own`, numbered from 0.
+    """
+    patch, n = np.empty_like(own), 0
+    rows = np.argsort(group, kind="stable")
+    while rows.size:
+        runs, at = _Runs(group[rows]), own[rows]
+        heights = np.einsum("ij,ij->i", centres[at], facets.normals[at[runs.first]][runs.of])
+        size = runs.low(sizes[at])[:, None]
+        extent = runs.extent(*facets.corners[at].transpose(1, 0, 2)) / size
+        turn = runs.extent(facets.normals[at]) / _TURN
+        depth = runs.extent(heights)[:, None] / (_DEEP * size)
+        bounds = np.column_stack([np.linalg.norm(extent, axis=1), np.linalg.norm(turn, axis=1), depth])
+        whole = (runs.length == 1) | (bounds.max(axis=1) <= 1)
+        along = np.column_stack([extent, turn, depth]).argmax(axis=1)[runs.of]
+        values = np.column_stack([centres[at], facets.normals[at], heights])[np.arange(len(at)), along]
+        middle = runs.low(values) + 0.5 * runs.extent(values)
+        upper = values >= middle[runs.of]
+        alone = (runs.sum(upper) % runs.length == 0)[runs.of]  # all in one place: a large facet beside small ones
+        part = np.where(alone, np.arange(len(at)) - runs.first[runs.of], upper)
+        done = whole[runs.of]
+        patch[rows[done]] = n + (np.cumsum(whole) - 1)[runs.of[done]]
+        n += int(whole.sum())
+        number = runs.of * len(at) + part
+        group[rows] = number
+        rows = rows[~done]
+        rows = rows[np.argsort(group[rows], kind="stable")]
+    return patch
 
 
 def _points_of(
-    leaf: NDArray[np.int64], facets: Facets
+    members: NDArray[np.int64], patches: _Runs, facets: Facets
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return a point in each quarter of a patch, the quarters' shares of its area, and the normals there."""
-    pieces, own, areas = facets.corners[leaf], leaf, facets.areas[leaf]
-    while (large := areas > areas.sum() / (2 * POINTS) * _EVEN).any():
-        halves, parents = _halved(pieces[large], own[large])
-        pieces, own = np.concatenate([pieces[~large], halves]), np.concatenate([own[~large], parents])
-        areas = np.concatenate([areas[~large], np.tile(0.5 * areas[large], 2)])
+    """Return a point in each quarter of the patches, the quarters' shares of their areas, and the normals there."""
+    pieces, own, areas, part = facets.corners[members], members, facets.areas[members], patches.of
+    most = patches.sum(areas) / (2 * POINTS) * _EVEN
+    while (large := areas > most[part]).any():
+        halves, cut = _halved(pieces[large], np.flatnonzero(large))
+        pieces, areas = np.concatenate([pieces[~large], halves]), np.concatenate([areas[~large], 0.5 * areas[cut]])
+        own, part = (np.concatenate([of[~large], of[cut]]) for of in (own, part))
     centres = pieces.mean(axis=1)
-    groups = [np.arange(len(own))]
-    for _ in range(2):
-        parts: list[NDArray[np.int64]] = []
-        for group in groups:
-            along = np.argmax(np.ptp(centres[group], axis=0))
-            order = group[np.argsort(centres[group, along], kind="stable")]
-            upto = np.cumsum(areas[order])
-            middle = int(np.clip(np.searchsorted(upto, 0.5 * upto[-1] / _EVEN) + 1, 1, len(order) - 1))
-            parts += [order[:middle], order[middle:]]
-        groups = parts
-    points, normals, weights = np.empty((POINTS, 3)), np.empty((POINTS, 3)), np.empty(POINTS)
-    for k, group in enumerate(groups):
-        middle = areas[group] @ centres[group] / areas[group].sum()
-        nearest = group[np.argmin(((centres[group] - middle) ** 2).sum(axis=1))]
-        points[k], normals[k], weights[k] = centres[nearest], facets.normals[own[nearest]], areas[group].sum()
-    return points, weights / weights.sum(), normals
+    order = np.argsort(part, kind="stable")
+    runs = _Runs(part[order])
+    for _ in range(2):  # in half, and each half again, across their largest extents
+        along = runs.extent(centres[order]).argmax(axis=1)[runs.of]
+        order = order[np.lexsort((centres[order, along], runs.of))]
+        upto = np.cumsum(areas[order] / runs.sum(areas[order])[runs.of]) - runs.of
+        middle = np.clip(runs.sum(upto < 0.5 / _EVEN) + 1, 1, runs.length - 1)
+        runs = _Runs(2 * runs.of + (np.arange(len(order)) >= (runs.first + middle)[runs.of]))
+    own, areas, centres = own[order], areas[order], centres[order]
+    weight = runs.sum(areas)
+    middles = runs.sum(areas[:, None] * centres) / weight[:, None]
+    nearest = runs.least(((centres - middles[runs.of]) ** 2).sum(axis=1))
+    weights = weight.reshape(-1, POINTS)
+    return (
+        centres[nearest].reshape(-1, POINTS, 3),
+        weights / weights.sum(axis=1, keepdims=True),
+        facets.normals[own[nearest]].reshape(-1, POINTS, 3),
+    )
 
 
-def _spread_as(
+def _spread(
     facets: Facets,
-    leaf: NDArray[np.int64],
+    members: NDArray[np.int64],
+    patches: _Runs,
     centre: NDArray[np.float64],
     points: NDArray[np.float64],
     weights: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Move points of a plane patch so that their mean square distance from its centre is the patch's, as Gauss's are.
+    """Move points of plane patches so that their mean square distance from its centre is the patch's, as Gauss's are.
 
-    They stay where they are if one would leave the patch.
+    Those of a patch stay where they are if one would leave it.
     """
-    corners, share = facets.corners[leaf] - centre, facets.areas[leaf] / facets.areas[leaf].sum()
+    triangles, areas = facets.corners[members], facets.areas[members]
+    corners = triangles - centre[patches.of, None]
     # mean square over a triangle: (sum of squares of the corners + square of their sum) / 12
-    square = share @ ((corners**2).sum(axis=(1, 2)) + (corners.sum(axis=1) ** 2).sum(axis=1)) / 12
-    offset = points - weights @ points
-    own = weights @ (offset**2).sum(axis=1)
-    moved = centre + offset * np.sqrt(square / own if own > 0 else 0.0)
-    return moved if _hold(facets.corners[leaf], facets.normals[leaf[0]], moved).all() else points
-
-
-def _hold(
-    triangles: NDArray[np.float64], normal: NDArray[np.float64], points: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Return whether points lie in any of some triangles of one plane."""
+    square = areas * ((corners**2).sum(axis=(1, 2)) + (corners.sum(axis=1) ** 2).sum(axis=1)) / 12
+    square = patches.sum(square) / patches.sum(areas)
+    offset = points - np.einsum("nk,nkj->nj", weights, points)[:, None]
+    own = np.einsum("nk,nkj->n", weights, offset**2)
+    moved = centre[:, None] + offset * np.sqrt(square / np.where(own > 0, own, np.inf))[:, None, None]
     along = np.roll(triangles, -1, axis=1) - triangles
-    to = points[:, None, None] - triangles
-    inward = np.cross(np.broadcast_to(along, to.shape), to) @ normal
-    return np.asarray(np.any((inward >= 0).all(axis=2), axis=1))
+    normal = facets.normals[members[patches.first]][patches.of]
+    inward = np.cross(normal[:, None], along)
+    to = moved[patches.of][:, :, None] - triangles[:, None]
+    inside = np.all(np.einsum("mej,mkej->mke", inward, to) >= 0, axis=2)
+    hold = np.all(np.logical_or.reduceat(inside, patches.first), axis=1)
+    return np.where(hold[:, None, None], moved, points)
 
 
 def _nearest_patch(
