@@ -21,9 +21,11 @@ _NEAR = 20.0
 """Those nearer than this take four points each; those beyond, one."""
 _SLOPING = 2.0
 """Over patches nearer than this the light that they send is taken as sloping, and as even over those beyond."""
+_FLAT = 1 - 1e-9
+"""Product of the mean normals of two patches above which both are plane and face the same way."""
 _BYTES, _MOST_GIB = 60, 16
 """Of a pair of patches that see each other, and of all."""
-_PAIRS = 1 << 21
+_PAIRS = 1 << 19
 """Pairs of patches that are looked at together."""
 
 
@@ -123,55 +125,98 @@ def transport_between(patches: Patches) -> Transport:
             " 'bounce_tolerance', render from fewer places at a time, or leave out bodies far from the camera's light"
         )
     rows = max(_PAIRS // n, 1)
-    one, other = np.empty((2, rows * n), np.int64)
+    one, other, near = np.empty((3, rows * n), np.int64)
     factor, way = np.empty((2, rows * n, 2))
-    moment = np.empty((rows * n, 2, 3))
     far = np.empty(rows * n, np.bool_)
+    moment = np.empty((rows * n, 2, 3))
     geometry = (
         patches.points, patches.normals, patches.weights, patches.centre, patches.normal, patches.area, patches.size,
     )  # fmt: skip
     polygons = patches.first, patches.members, patches.side, patches.facets.corners
+    pairs = 0
     for start in range(0, n, rows):
-        m = _form_factors(start, min(start + rows, n), geometry, polygons, one, other, factor, way, moment, far)
-        visible = np.empty(m)
-        visible[far[:m]] = _seen_by_centres(patches, one[:m][far[:m]], other[:m][far[:m]])
-        visible[~far[:m]] = _seen_by_points(patches, one[:m][~far[:m]], other[:m][~far[:m]])
-        visible[one[:m] == other[:m]] = 1.0
+        m, m_near = _form_factors(
+            start, min(start + rows, n), geometry, polygons, one, other, factor, way, far, near, moment
+        )
+        visible = _visible(patches, geometry, one[:m], other[:m], far[:m])
         kept = visible > 0
-        sloping = np.asarray(moment[:m].any(axis=(1, 2)))[kept]
-        moments = (moment[:m] * visible[:, None, None])[kept][sloping]
-        pairs = one[:m][kept], other[:m][kept], (factor[:m] * visible[:, None])[kept], way[:m][kept]
-        found.append((*pairs, sloping, moments))
-    i, j, factors, ways, near, moments = (np.concatenate(column) for column in zip(*found, strict=True))
-    near = np.flatnonzero(near)
+        sloping = near[:m_near][kept[near[:m_near]]]
+        found.append(
+            (
+                one[:m][kept],
+                other[:m][kept],
+                factor[:m][kept] * visible[kept, None],
+                way[:m][kept],
+                pairs + (np.cumsum(kept) - 1)[sloping],
+                moment[:m_near][kept[near[:m_near]]] * visible[sloping, None, None],
+            )
+        )
+        pairs += int(kept.sum())
+    i, j, factors, ways, sloping, moments = (np.concatenate(column) for column in zip(*found, strict=True))
     received = np.bincount(i, factors[:, 0], n) + np.bincount(j, factors[:, 1], n)
     most = np.maximum(np.column_stack([received[i], received[j]]), 1.0)  # no patch receives more than all
-    return Transport(i, j, factors / most, ways, near, moments / most[near, :, None], slopes_of(patches))
+    return Transport(i, j, factors / most, ways, sloping, moments / most[sloping, :, None], slopes_of(patches))
 
 
-def _seen_by_centres(patches: Patches, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return whether a point in the middle of each patch sees that of another."""
-    lifted = patches.outlook + patches.lift_m * patches.normal
-    return patches.sees(lifted[i], lifted[j])
+def _visible(
+    patches: Patches, geometry: Any, one: NDArray[np.int64], other: NDArray[np.int64], far: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """Return which share of the light between pairs of patches nothing stands in the way of, (m,).
 
-
-def _seen_by_points(patches: Patches, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return which share of the light between them four pairs of points of patches see."""
-    points, normals = patches.points, patches.normals
-    lifted = points + patches.lift_m * normals
-    seen, total = np.zeros(len(i)), np.full(len(i), 1e-300)
-    for k in range(POINTS):
-        share = np.empty(len(i))
-        _fill_kernel(points[i, k], normals[i, k], points[j, k], normals[j, k], share)
-        seen += share * patches.sees(lifted[i, k], lifted[j, k])
-        total += share
-    return np.asarray(seen / total)
+    Points in the middle say so of those that are far from one another, four pairs of points of the others.
+    """
+    m = len(one)
+    middles = patches.outlook + patches.lift_m * patches.normal
+    points = patches.points + patches.lift_m * patches.normals
+    begin, along = np.empty((2, POINTS * m, 3), np.float32)
+    pair, share = np.empty(POINTS * m, np.int64), np.empty(POINTS * m)
+    n_rays = _fill_rays(one, other, far, geometry, middles, points, begin, along, pair, share)
+    facet = patches.intersector.first_face(begin[:n_rays], along[:n_rays])
+    visible = np.empty(m)
+    _sum_seen(begin, along, pair, share, facet, patches.facets.normals, patches.facets.corners, visible)
+    visible[one == other] = 1.0
+    return visible
 
 
 @kernel
-def _fill_kernel(p, n, q, m, out):  # type: ignore[no-untyped-def]
-    for k in range(len(out)):
-        out[k] = _kernel(p[k], n[k], q[k], m[k])
+def _fill_rays(one, other, far, geometry, middles, points, begin, along, pair, share):  # type: ignore[no-untyped-def]
+    """Write rays between pairs of patches with the light that each stands for; return how many."""
+    at, normals = geometry[0], geometry[1]
+    count = 0
+    for p in range(len(one)):
+        i, j = one[p], other[p]
+        for k in range(1 if far[p] else POINTS):
+            share[count] = 1.0 if far[p] else _kernel(at[i, k], normals[i, k], at[j, k], normals[j, k])
+            if share[count] > 0.0:
+                pair[count] = p
+                for axis in range(3):
+                    begins = middles[i, axis] if far[p] else points[i, k, axis]
+                    begin[count, axis] = begins
+                    along[count, axis] = (middles[j, axis] if far[p] else points[j, k, axis]) - begins
+                count += 1
+    return count
+
+
+@kernel
+def _sum_seen(begin, along, pair, share, facet, normals, corners, visible):  # type: ignore[no-untyped-def]
+    """Write the share of each pair's light whose rays meet nothing before their end."""
+    for p in range(len(visible)):
+        visible[p] = 0.0
+    ray = 0
+    while ray < len(facet):
+        p, seen, total = pair[ray], 0.0, 0.0
+        while ray < len(facet) and pair[ray] == p:
+            f = facet[ray]
+            facing, height = 0.0, 0.0
+            if f >= 0:
+                for axis in range(3):
+                    facing += normals[f, axis] * along[ray, axis]
+                    height += normals[f, axis] * (corners[f, 0, axis] - begin[ray, axis])
+            if f < 0 or (facing != 0.0 and height / facing >= 1.0):
+                seen += share[ray]
+            total += share[ray]
+            ray += 1
+        visible[p] = seen / total
 
 
 @kernel
@@ -186,10 +231,13 @@ def _kernel(p, n, q, m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _form_factors(start, stop, geometry, polygons, one, other, factor, way, moment, far):  # type: ignore[no-untyped-def]
-    """Write pairs of patches, the first from `start` to `stop`, as if nothing stood between; return how many."""
+def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far, near, moment):  # type: ignore[no-untyped-def]
+    """Write pairs of patches, the first from `start` to `stop`, as if nothing stood between; return how many.
+
+    `near` are those over which light slopes, with a `moment` each; their number is returned, too.
+    """
     points, normals, weights, centre, normal, area, size = geometry
-    count = 0
+    count, count_near = 0, 0
     for i in range(start, stop):
         for j in range(i, len(area)):
             x, y, z = centre[j, 0] - centre[i, 0], centre[j, 1] - centre[i, 1], centre[j, 2] - centre[i, 2]
@@ -198,9 +246,10 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, mome
                 continue
             if x * normal[j, 0] + y * normal[j, 1] + z * normal[j, 2] > reach:
                 continue
+            if normal[i, 0] * normal[j, 0] + normal[i, 1] * normal[j, 1] + normal[i, 2] * normal[j, 2] > _FLAT:
+                continue  # planes that face the same way
             distance = math.sqrt(x * x + y * y + z * z)
             total, first, second = 0.0, 0.0, 0.0
-            moment[count] = 0.0
             if distance > _NEAR * reach:
                 total = _kernel(centre[i], normal[i], centre[j], normal[j])
                 first, second = total * distance, total * distance * distance
@@ -208,14 +257,16 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, mome
                 for k in range(POINTS):
                     for m in range(POINTS):
                         pair = _kernel(points[i, k], normals[i, k], points[j, m], normals[j, m])
-                        pair *= weights[i, k] * weights[j, m]
-                        square = 0.0
-                        for axis in range(3):
-                            square += (points[i, k, axis] - points[j, m, axis]) ** 2
-                        total, first, second = total + pair, first + pair * math.sqrt(square), second + pair * square
-                        for axis in range(3):
-                            moment[count, 0, axis] += pair * (points[j, m, axis] - centre[j, axis])
-                            moment[count, 1, axis] += pair * (points[i, k, axis] - centre[i, axis])
+                        if pair > 0.0:
+                            pair *= weights[i, k] * weights[j, m]
+                            square = 0.0
+                            for axis in range(3):
+                                square += (points[i, k, axis] - points[j, m, axis]) ** 2
+                            total, first, second = (
+                                total + pair,
+                                first + pair * math.sqrt(square),
+                                second + pair * square,
+                            )
             if total == 0.0:
                 continue
             one[count], other[count], far[count] = i, j, distance > _NEAR * reach
@@ -226,12 +277,26 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, mome
             else:
                 factor[count, 0] = _closely(i, j, geometry, polygons)
                 factor[count, 1] = 0.0 if i == j else _closely(j, i, geometry, polygons)
-            for side in range(2):
-                scale = factor[count, side] / total if distance < _SLOPING * reach and i != j else 0.0
-                for axis in range(3):
-                    moment[count, side, axis] *= scale
+            if distance < _SLOPING * reach and i != j:
+                near[count_near] = count
+                _fill_moment(i, j, geometry, factor[count, 0] / total, factor[count, 1] / total, moment[count_near])
+                count_near += 1
             count += 1
-    return count
+    return count, count_near
+
+
+@kernel
+def _fill_moment(i, j, geometry, of_one, of_other, moment):  # type: ignore[no-untyped-def]
+    """Write the moments of a pair: of the kernel between its points, in units of `of_one` and `of_other`."""
+    points, normals, weights, centre, _, _, _ = geometry
+    for axis in range(3):
+        moment[0, axis], moment[1, axis] = 0.0, 0.0
+    for k in range(POINTS):
+        for m in range(POINTS):
+            pair = _kernel(points[i, k], normals[i, k], points[j, m], normals[j, m]) * weights[i, k] * weights[j, m]
+            for axis in range(3):
+                moment[0, axis] += of_one * pair * (points[j, m, axis] - centre[j, axis])
+                moment[1, axis] += of_other * pair * (points[i, k, axis] - centre[i, axis])
 
 
 @kernel
