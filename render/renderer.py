@@ -38,7 +38,7 @@ from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
 if TYPE_CHECKING:
-    from phasemark.render.bounces.standing import StandingLight, Stands
+    from phasemark.render.bounces.standing import StandingLight
 
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
@@ -116,7 +116,6 @@ class Renderer:
         self.sensor = sensor
         self.albedo = float(albedo)
         self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
-        self._stands: Stands = {}
         self._standing: StandingLight | None = None
         self._integral = AreaIntegral(
             self.topology,
@@ -498,12 +497,12 @@ class Renderer:
         sums.intensity[:] += light[:, 0].real
 
     def _bouncing(self, columns_hz: Sequence[float]) -> StandingLight:
-        """Return the source of light that bounces; patches are shared with other albedos and cameras."""
-        from phasemark.render.bounces.standing import StandingLight
+        """Return the source of light that bounces."""
+        from phasemark.render.bounces.standing import standing_light
 
         if self._standing is None or not self._standing.is_of(self.albedo, self.sensor):
             frequencies = [0.0, *columns_hz]
-            self._standing = StandingLight(self.topology, self.albedo, self.sensor, frequencies, stands=self._stands)
+            self._standing = standing_light(self.topology, self.albedo, self.sensor, frequencies)
         return self._standing
 
     def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from builders import run_program
 from own_matchers import Fails
+from scipy import stats
 
 from phasemark import OutputExistsError, UsageError
 from phasemark.cli import main
@@ -90,12 +91,8 @@ def test_a_sensor_with_a_chip_is_simulated_and_explained_as_its_chip_reports(tmp
 
 
 def test_what_a_chip_reports_is_not_asked_of_a_camera(tmp_path):
-    with pytest.raises(
-        UsageError, match=r"method 'chip', condition 0, .*: on=\"reported\" goes with .* \[histogram\] table"
-    ):
-        run_sweep(plan(methods=[Method(name="chip", on="reported")]), tmp_path)
     with pytest.raises(UsageError, match=r"method 'chip': on=\"reported\" needs a sensor with a \[histogram\] table"):
-        SweepJob(plan(methods=[Method(name="chip", on="reported")]), Round(0, (0,), 0, 1)).check_views()
+        run_sweep(plan(methods=[Method(name="chip", on="reported")]), tmp_path)
 
 
 def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
@@ -123,6 +120,7 @@ def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
         ({"trials": 0}, "'trials' must be greater than or equal to 2, got 0"),
         ({"axes": {"colour": [1.0]}}, "unknown axis 'colour'"),
         ({"axes": {"n_frames": [2.5]}}, "'n_frames' must be a whole number"),
+        ({"axes": {"bounces": [1], "floor_m": [0]}}, "'bounces' needs a 'wall_m' or a 'floor_m' that the light"),
         ({"methods": [Method(name="a"), Method(name="a")]}, "each needs a name of its own"),
     ],
 )
@@ -232,6 +230,36 @@ def test_a_folder_with_a_sweep_is_not_overwritten_unasked(reference):
         run_sweep(plan(), reference[0])
     with pytest.raises(OutputExistsError, match="another plan"):
         run_sweep(plan(seed=1), reference[0], resume=True)
+
+
+def test_conditions_that_cannot_be_seen_are_named_before_a_folder_is_made(tmp_path):
+    folder = tmp_path / "none"
+    for axes, message in (
+        ({"floor_m": [0.15], "bounces": [0, 1]}, "condition 1: light that bounces needs the sensor's 'lamp_half_angle"),
+        ({"wall_m": [0, 1.0]}, "condition 1: the wall at 1 m"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            run_sweep(plan(axes=axes), folder, workers=1)
+    assert not folder.exists()
+
+
+def test_light_that_bounces_is_in_the_world_and_in_a_method_that_knows_it(tmp_path):
+    known = {"name": "small", "classes": ["cone"], "trials": 10, "bank_distance_m": (0.95, 1.05), "spread": (0.01, 1)}
+    behind = {"wall_m": [2.0], "floor_m": [0.15], "bounces": [0, 2]}
+    methods = [Method(name="direct"), Method(name="bounces", knows="bounces"), Method(name="none", knows="nothing")]
+    trials = run_sweep(
+        SweepPlan(**known, axes=behind, methods=methods, sensor_overrides={"lamp_half_angle_deg": 30.0}), tmp_path
+    )
+    direct, knowing, ignorant = (
+        [cell for cell in trials.cells() if cell.method == name] for name in ("direct", "bounces", "none")
+    )
+    assert [cell.accepted.value for cell in direct] == [1, 0]
+    assert [cell.accepted.value for cell in knowing] == [1, 1]
+    assert [cell.accepted.value for cell in ignorant] == [0, 0]  # a wall and a floor are neither there to it
+    # it is the bounces that move D, by more than ten standard deviations; 10 trials of two parameters each
+    moved = direct[1].bias["distance_m"].value / direct[1].bound["distance_m"]
+    assert moved > 10
+    assert stats.chi2.ppf(0.001, 20) < 20 * knowing[1].nees.value < stats.chi2.ppf(0.999, 20)
 
 
 def test_star_varies_each_axis_alone_and_sobol_stays_inside():

@@ -18,7 +18,9 @@ Folder = Annotated[Path, Shown(metavar="DIR", help="A sweep's folder.")]
 
 
 def sweep_run(
-    plan_or_name: Annotated[str, Shown(autocompletion=one_of("paper", "distance-angle-noise", "robustness", "demo"))],
+    plan_or_name: Annotated[
+        str, Shown(autocompletion=one_of("paper", "distance-angle-noise", "robustness", "multipath", "demo"))
+    ],
     *,
     out: Out,
     trials: int | None = None,
@@ -35,7 +37,7 @@ def sweep_run(
     Parameters
     ----------
     plan_or_name
-        A plan (.toml), or paper, distance-angle-noise, robustness or demo.
+        A plan (.toml), or paper, distance-angle-noise, robustness, multipath or demo.
     out
         Folder for trials, tables and the report.
     trials

@@ -21,7 +21,7 @@ SAID = {
     "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
     "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
     "roll_deg": "a roll of {:g}°", "wiggling": "wiggling of {:g}", "unit": "unit {:g}",
-    "dimension_error": "dimensions off by {:g}",
+    "dimension_error": "dimensions off by {:g}", "floor_m": "a floor at {:g} m", "bounces": "{:g} bounces",
 }  # fmt: skip
 """A condition in words, by the name of its axis."""
 ACCURATE = ("distance_m", "delta_rad")

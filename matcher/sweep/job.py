@@ -37,7 +37,7 @@ from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.matcher.sweep.own_matcher import MatchFrames, imported_matcher, own_matches
-from phasemark.matcher.sweep.plan import Method, SweepPlan
+from phasemark.matcher.sweep.plan import Condition, Method, SweepPlan
 from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
 from phasemark.render.direct.capture import capture_ranges
 from phasemark.render.direct.chip_renderer import ChipRenderer
@@ -76,7 +76,7 @@ def _fields(p: int) -> tuple[tuple[_Field, ...], tuple[_Field, ...]]:
 
 STORED = ("condition", "trial", *(name for fields in _fields(0) for name, *_ in fields))
 """Names of all arrays that a file of trials holds."""
-_REFERENCE = Method(name="reference")
+_REFERENCE = Method(name="reference", knows="bounces")
 """Maximum likelihood on ranges before a known background."""
 _WIGGLES = (3, 5, 7)
 
@@ -124,7 +124,7 @@ class SweepJob:
         self.class_names = tuple(part.name for part in known)
         self.objects = {part.name: part for part in (*known, *read_landmarks(plan.strangers, ()))}
         self._banks: dict[str, Bank] = {}
-        self._matchers: dict[tuple[Method, float], MatchFrames] = {}
+        self._matchers: dict[tuple[Method, Background | Literal["auto"] | None], MatchFrames] = {}
         self._renderers: dict[tuple[Any, ...], Renderer] = {}
         self._guard = threading.Lock()
 
@@ -294,8 +294,7 @@ class SweepJob:
 
     def background(self, number: int) -> Background | None:
         """Return the true background of a condition."""
-        wall_m = self.all_conditions[number].wall_m
-        return Background(wall_m=wall_m) if wall_m else None
+        return self.all_conditions[number].background()
 
     def image(self, number: int, views: Views) -> PhasorImages:
         """Return noise-free images of a condition's true camera at some views."""
@@ -361,7 +360,7 @@ class SweepJob:
         exact = noise_free(image, condition.n_frames, counts(image.phasor, image.intensity, sensor))
         squares = np.full((n, len(self.class_names)), DEFAULT_POLICY.likely_cost)
         squares[:, self.class_names.index(condition.class_name)] = np.inf
-        for k, match in enumerate(self.matcher(_REFERENCE, condition.wall_m)(exact)):
+        for k, match in enumerate(self.matcher(_REFERENCE, condition)(exact)):
             for other in match.alternatives:
                 c = self.class_names.index(other.class_name)
                 if other.class_name != condition.class_name:
@@ -371,22 +370,22 @@ class SweepJob:
         found[:n] = confusion_probability(squares)
         return found
 
-    def matcher(self, method: Method, wall_m: float) -> MatchFrames:
-        """Return a method, ready to match frames before a wall that it may know; it is kept."""
-        if method.knows != "wall":
-            wall_m = 0.0
+    def matcher(self, method: Method, condition: Condition) -> MatchFrames:
+        """Return a method, ready to match frames before the background that it may know; it is kept."""
+        background: Background | Literal["auto"] | None = None
+        if method.knows in ("wall", "bounces"):
+            background = condition.background(bounces=method.knows == "bounces")
+        elif method.knows == "auto":
+            background = "auto"
         with self._guard:
-            if (method, wall_m) not in self._matchers:
-                self._matchers[method, wall_m] = self._matcher(method, wall_m)
-            return self._matchers[method, wall_m]
+            if (method, background) not in self._matchers:
+                self._matchers[method, background] = self._matcher(method, background)
+            return self._matchers[method, background]
 
-    def _matcher(self, method: Method, wall_m: float) -> MatchFrames:
+    def _matcher(self, method: Method, background: Background | Literal["auto"] | None) -> MatchFrames:
         if method.is_program:
             return imported_matcher(method.method)
         bank = self._bank(method)
-        background: Background | Literal["auto"] | None = Background(wall_m=wall_m) if wall_m else None
-        if method.knows == "auto":
-            background = "auto"
         if method.method == "nearest":
             return Matcher(bank, background=background, false_alarm=method.false_alarm).match
         on = self.explained(method)
@@ -410,13 +409,13 @@ class SweepJob:
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]
         where = f"method '{method.name}', condition {number}, trials {first} … {first + len(frames) - 1}"
-        wall_m = self.all_conditions[number].wall_m
+        condition = self.all_conditions[number]
         if method.is_program:
-            match = self.matcher(method, wall_m)
+            match = self.matcher(method, condition)
             matches = own_matches(match, method.method, frames, where, VIEW[: self.plan.n_numbers])
         else:
             try:
-                matches = Matches(self.matcher(method, wall_m)(frames))
+                matches = Matches(self.matcher(method, condition)(frames))
             except PhasemarkError as error:
                 raise type(error)(f"{where}: {error}") from None
         for k, one in enumerate(matches):

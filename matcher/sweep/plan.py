@@ -23,9 +23,10 @@ from phasemark.data.seeds import stream
 from phasemark.inputs import MOST_TOML_BYTES, read_text
 from phasemark.landmarks import LandmarkSpec
 from phasemark.matcher.likelihood.images import LEVEL_VIEW, VIEW
+from phasemark.render import Background
 
 _MOST_CELLS = 100_000
-SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness", "demo")
+SHIPPED_SWEEPS = ("paper", "distance-angle-noise", "robustness", "multipath", "demo")
 """Names of the plans that come with the program."""
 
 
@@ -61,6 +62,11 @@ class Condition:
         Number of the camera unit, which has a phase offset in each pixel of its own; 0: a camera without offsets.
     dimension_error : float
         Relative excess of the true landmark's dimensions over the model's.
+    floor_m : float
+        How far a floor lies below the lens, metres; 0: no floor.
+    bounces : int
+        How often light bounces between landmark, wall and floor (PHYSICS section 12). Of a lamp that does not say how
+        wide it shines, only 0.
     """
 
     class_name: str
@@ -77,17 +83,26 @@ class Condition:
     unit: int = 0
     dimension_error: float = 0.0
     roll_deg: float = 0.0
+    floor_m: float = 0.0
+    bounces: int = 0
+
+    def background(self, *, bounces: bool = True) -> Background | None:
+        """Return what stands behind the landmark, with light that bounces there or without; None: nothing."""
+        if not (self.wall_m or self.floor_m):
+            return None
+        return Background(self.wall_m or None, self.floor_m or None, bounces=self.bounces if bounces else 0)
 
 
 AXES = tuple(field.name for field in fields(Condition))
 """Names of a condition's fields, each of which may be an axis."""
-MODEL_ERRORS = ("bearing_deg", "height_m", "pitch_deg", "roll_deg", "wiggling", "unit", "dimension_error")
+MODEL_ERRORS = ("bearing_deg", "height_m", "pitch_deg", "roll_deg", "wiggling", "unit", "dimension_error", "bounces")
 """Axes on which the world differs from what a method takes it to be, unless they are 0."""
-_WHOLE = ("n_frames", "unit")
+_WHOLE = ("n_frames", "unit", "bounces")
 _LIMITS: dict[str, tuple[float, float]] = {
     "distance_m": (1e-3, 1e3), "noise_factor": (1e-3, 1e3), "n_frames": (1, 100_000), "bearing_deg": (-45, 45),
     "height_m": (-10, 10), "pitch_deg": (-45, 45), "roll_deg": (-45, 45), "albedo": (1e-3, 1), "wall_m": (0, 1e3),
     "wiggling": (0, 1), "unit": (0, 2**62), "dimension_error": (-0.5, 0.5), "delta_deg": (-360, 360),
+    "floor_m": (0, 1e3), "bounces": (0, 100),
 }  # fmt: skip
 
 
@@ -135,8 +150,9 @@ class Method(PlanModel):
         Which pixels ``refine`` compares: all, or the lower half of the rows.
     free : sequence of {"bearing", "height", "pitch", "roll"}
         What is estimated beside distance and angle.
-    knows : {"wall", "auto", "nothing"}
-        Background that the method assumes: the true one, one estimated from the frames, or none.
+    knows : {"wall", "bounces", "auto", "nothing"}
+        Background that the method assumes: the true wall and floor in direct light alone, the same with the light that
+        bounces between them and the landmark, one estimated from the frames, or none.
     bank_model : {"ray", "hard", "planar"}
         `model` of the method's bank; ``hard`` and ``planar`` have no mixed pixels and go with ``nearest`` only.
     bank_step : (metres, degrees)
@@ -151,7 +167,7 @@ class Method(PlanModel):
     on: Literal["ranges", "phasors", "reported"] | None = None
     pixels: Literal["all", "lower"] = "all"
     free: tuple[Literal["bearing", "height", "pitch", "roll"], ...] = ()
-    knows: Literal["wall", "auto", "nothing"] = "wall"
+    knows: Literal["wall", "bounces", "auto", "nothing"] = "wall"
     bank_model: Literal["ray", "hard", "planar"] = "ray"
     bank_step: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.01, 1.0)
     false_alarm: Annotated[float, Field(gt=0, lt=1)] = 0.01
@@ -277,6 +293,9 @@ class SweepPlan(ScenePlan):
                 if not (math.isfinite(value) and low <= value <= high) or (name in _WHOLE and value != int(value)):
                     kind = "a whole number" if name in _WHOLE else "a number"
                     raise UsageError(f"axes: '{name}' must be {kind} in [{low:g}, {high:g}], got {value:g}")
+        nothing_behind = not any(any(self.axes.get(name, ())) for name in ("wall_m", "floor_m"))
+        if any(self.axes.get("bounces", ())) and nothing_behind:
+            raise UsageError("axes: 'bounces' needs a 'wall_m' or a 'floor_m' that the light bounces off")
         low, high = self.bank_distance_m
         half = self.spread[0] / 2
         for value in self.axes.get("distance_m", (1.0,)):
@@ -354,7 +373,8 @@ class SweepPlan(ScenePlan):
 
     def greatest_distances_m(self) -> dict[str, float]:
         """Return the far end of the axes of distances, and of the banks, metres."""
-        axes = {f"axes.{name}": max(self.axes[name]) for name in ("distance_m", "wall_m") if name in self.axes}
+        names = [name for name in ("distance_m", "wall_m", "floor_m") if name in self.axes]
+        axes = {f"axes.{name}": max(self.axes[name]) for name in names}
         return {**axes, "bank_distance_m": self.bank_distance_m[1]}
 
     @property

@@ -82,6 +82,7 @@ def run_sweep(
         if method.is_program:
             imported_matcher(method.method)
     check_scheduler(scheduler)
+    SweepJob(plan, Round.first_of(plan)).check_views()
     folder = Path(folder)
     refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
     with sweep_folder(folder) as ours:

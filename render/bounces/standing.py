@@ -8,10 +8,12 @@ exactly.
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Sequence
 from threading import Lock
 from typing import Any, NamedTuple
+from weakref import WeakValueDictionary
 
 import numpy as np
 import trimesh
@@ -128,8 +130,31 @@ class Stand:
         self.outlook = patches.outlook[first] + patches.lift_m * patches.normal[first]
 
 
-Stands = dict[tuple[int | None, tuple[float, ...]], Stand]
-"""Landmarks on floors, by how far below the foot the floor is, and wave numbers."""
+_SHARING = Lock()
+_STANDS: WeakValueDictionary[tuple[Any, ...], Stand] = WeakValueDictionary()
+_LIGHTS: dict[tuple[Any, ...], StandingLight] = {}
+_MOST_LIGHTS = 4
+"""Lights that are kept for renderers to come, those used last; each has some 100 MB."""
+
+
+def standing_light(mesh: MeshTopology, albedo: float, sensor: Sensor, frequencies_hz: Sequence[float]) -> StandingLight:
+    """Return the light of a landmark, an albedo and a camera: one that was used before, if it is kept.
+
+    Arguments are those of :class:`StandingLight`.
+    """
+    key = _mesh_digest(mesh), albedo, sensor.model_dump_json(), tuple(frequencies_hz)
+    with _SHARING:
+        found = _LIGHTS.pop(key, None) or StandingLight(mesh, albedo, sensor, frequencies_hz)
+        _LIGHTS[key] = found
+        if len(_LIGHTS) > _MOST_LIGHTS:
+            del _LIGHTS[next(iter(_LIGHTS))]
+    return found
+
+
+def _mesh_digest(mesh: MeshTopology) -> bytes:
+    digest = hashlib.blake2b(mesh.vertices.tobytes(), digest_size=16)
+    digest.update(mesh.faces.tobytes())
+    return digest.digest()
 
 
 class StandingLight:
@@ -147,8 +172,6 @@ class StandingLight:
         Of the phasors; 0: of intensities.
     kind : {"auto", "embree", "float64"}
         Intersector.
-    stands : Stands, optional
-        Where the patches of this landmark are kept, for other albedos and cameras to share.
     """
 
     def __init__(
@@ -159,11 +182,11 @@ class StandingLight:
         frequencies_hz: Sequence[float],
         *,
         kind: str = "auto",
-        stands: Stands | None = None,
     ) -> None:
         self._mesh, self._albedo, self._sensor, self._kind = mesh, albedo, sensor, kind
         self._wave_numbers = [2 * math.pi * hz / SPEED_OF_LIGHT_M_S for hz in frequencies_hz]
-        self._stands = {} if stands is None else stands
+        self._stands: dict[int | None, Stand] = {}
+        self._stand_key = _mesh_digest(mesh), tuple(self._wave_numbers), kind
         self._nodes: dict[tuple[object, ...], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
         self._among: dict[tuple[float, float, float], NDArray[np.float64]] = {}
         self._radius_m = float(np.hypot(*mesh.vertices[:, :2].T).max(initial=0.0))
@@ -180,11 +203,13 @@ class StandingLight:
             foot = float(self._mesh.low[2])
             key = round((foot - floor_z) / _SNAP_M)
             floor_z = foot - key * _SNAP_M
-        with self._lock:
-            name = key, tuple(self._wave_numbers)
-            if name not in self._stands:
-                self._stands[name] = Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
-        return key, self._stands[name]
+        with _SHARING:
+            if key not in self._stands:
+                found = _STANDS.get((key, *self._stand_key))
+                if found is None:
+                    found = Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
+                self._stands[key] = _STANDS[key, *self._stand_key] = found
+        return key, self._stands[key]
 
     def is_of(self, albedo: float, sensor: Sensor) -> bool:
         """Return True if it is that of an albedo and a camera."""
@@ -425,11 +450,14 @@ class StandingLight:
         n = sheets.n_wall
         albedo = np.where((np.arange(len(sheets.area)) < n)[:, None], view.wall_albedo, _ALBEDOS)
         key = view.wall_m, view.floor_m, sheets.depth_m
-        if key not in self._among:
-            self._among = {**self._among, key: sheets.between()}
+        among = self._among.get(key)
+        if among is None:
+            among = sheets.between()
+            with self._lock:
+                self._among = {**self._among, key: among}
         apart = np.linalg.norm(sheets.centre[:, None] - sheets.centre, axis=2)
         return _Coupled(
-            exchange, distance, self._among[key], apart, sheets.area, albedo,
+            exchange, distance, among, apart, sheets.area, albedo,
             light.reshape(points.shape[:2]), way.reshape(points.shape[:2]),
         )  # fmt: skip
 

@@ -19,9 +19,10 @@ AXIS_LABEL = {
     "roll_deg": "roll (°)",
     "albedo": "albedo", "wall_m": "wall (m)", "wiggling": "wiggling, relative to square against square",
     "unit": "unit, with its fixed pattern", "dimension_error": "relative error of the dimensions",
+    "floor_m": "floor below the lens (m)", "bounces": "bounces of the light",
 }  # fmt: skip
 LOGARITHMIC = ("distance_m", "noise_factor", "n_frames", "albedo")
-NOMINAL = ("unit", "wall_m")
+NOMINAL = ("unit", "wall_m", "floor_m", "bounces")
 """Axes whose values lie beside one another without anything between them; 0 stands for none."""
 
 
