@@ -10,12 +10,10 @@ from typing import Literal
 
 from phasemark import UsageError
 from phasemark.data.export.bop import write_bop
-from phasemark.data.export.clouds import write_ply
-from phasemark.data.export.histograms import write_jsonl, write_targets_csv
-from phasemark.data.export.images import write_png16
+from phasemark.data.export.images import write_ply, write_png16
 from phasemark.data.export.lerobot import write_lerobot
 from phasemark.data.export.rosbag import write_rosbag
-from phasemark.data.export.tables import write_csv, write_npz
+from phasemark.data.export.tables import write_csv, write_jsonl, write_npz, write_targets_csv
 from phasemark.data.export.webdataset import write_webdataset
 from phasemark.data.files.atomic_write import refuse_unwritable, replacing
 from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder

@@ -10,46 +10,29 @@ from typing import Any, NamedTuple
 from phasemark.data.files.json_text import json_text
 from phasemark.data.frames.frame_set_file import FrameSet, SceneFrameSet
 
-_VOCABULARY = {
-    "@language": "en",
-    "@vocab": "https://schema.org/",
-    "arrayShape": "cr:arrayShape",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "equivalentProperty": "cr:equivalentProperty",
-    "examples": {"@id": "cr:examples", "@type": "@json"},
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileObject": "cr:fileObject",
-    "fileProperty": "cr:fileProperty",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isArray": "cr:isArray",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
-    "samplingRate": "cr:samplingRate",
-    "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-}
+_OWN_WORDS = (
+    "arrayShape", "citeAs", "column", "equivalentProperty", "extract", "field", "fileObject", "fileProperty",
+    "fileSet", "format", "includes", "isArray", "isLiveDataset", "jsonPath", "key", "md5", "parentField", "path",
+    "recordSet", "references", "regex", "repeated", "replace", "samplingRate", "separator", "source", "subField",
+    "transform",
+)  # fmt: skip
+_VOCABULARY: dict[str, Any] = dict(
+    sorted(
+        {
+            "@language": "en",
+            "@vocab": "https://schema.org/",
+            "conformsTo": "dct:conformsTo",
+            "cr": "http://mlcommons.org/croissant/",
+            "data": {"@id": "cr:data", "@type": "@json"},
+            "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+            "dct": "http://purl.org/dc/terms/",
+            "examples": {"@id": "cr:examples", "@type": "@json"},
+            "rai": "http://mlcommons.org/croissant/RAI/",
+            "sc": "https://schema.org/",
+            **{word: f"cr:{word}" for word in _OWN_WORDS},
+        }.items()
+    )
+)
 _KINDS = {"f": "sc:Float", "i": "sc:Integer", "u": "sc:Integer", "b": "sc:Boolean", "s": "sc:Text"}
 
 
@@ -105,13 +88,8 @@ def _readme(frames: FrameSet, layout: str, columns: Sequence[Column], load: str)
     facts = frames.info()
     lines = ["---", "tags:", "- time-of-flight", "- simulated", f"- {layout}"]
     if layout == "LeRobot":
-        lines += [
-            "task_categories:",
-            "- robotics",
-            "configs:",
-            "- config_name: default",
-            "  data_files: data/*/*.parquet",
-        ]
+        lines += ["task_categories:", "- robotics", "configs:", "- config_name: default"]
+        lines += ["  data_files: data/*/*.parquet"]
     lines += ["---", "", f"# {_title(frames)}", "", _facts(frames), "", "```python", load, "```", ""]
     lines += ["| column | type | shape |", "|---|---|---|"]
     lines += [f"| `{one.name}` | {one.kind} | {' × '.join(map(str, one.shape)) or '1'} |" for one in columns]

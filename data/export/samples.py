@@ -12,17 +12,13 @@ from numpy.typing import NDArray
 
 from phasemark.data.frames.frame_set_file import FrameSet, Sample, SceneFrameSet
 from phasemark.data.measured.reading import RangeOrZ
+from phasemark.data.plans.arrays import TRUTH_KEYS
 from phasemark.data.plans.frame_plan import TILT
 from phasemark.render import Sensor, Views
 from phasemark.render.view import VIEW_FIELDS
 
 BLOCK = 1024
 """Frames read at a time."""
-
-TRUTH = (
-    "distance_m", "delta_deg", "bearing_deg", "height_m", "pitch_deg", "roll_deg", "albedo", "wall_m", "floor_m",
-)  # fmt: skip
-"""Truth of a frame beside its class, in the units of plans; a sample has angles in radians."""
 
 
 def blocks(frames: FrameSet) -> Iterator[tuple[int, Sample]]:
@@ -49,9 +45,9 @@ def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
         "class": np.asarray(sample["class_name"], dtype=str),
         "split": np.array(frames.splits)[sample["split_index"]],
     }
-    for name in TRUTH:
+    for name in TRUTH_KEYS.values():
         if name not in TILT or getattr(frames.plan, name) is not None:
-            values = np.asarray(sample[name.replace("_deg", "_rad")], float)
+            values = np.asarray(sample[name.replace("_deg", "_rad")], float)  # a sample has angles in radians
             columns[name] = np.rad2deg(values) if name.endswith("_deg") else values
     return columns
 

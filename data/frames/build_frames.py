@@ -16,7 +16,7 @@ from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.frame_set_file import FrameSet, open_frames
 from phasemark.data.frames.frames_job import Column, FramesJob, joined_images
 from phasemark.data.frames.scene_frames_job import SceneFramesJob
-from phasemark.data.plans.arrays import TRUTH
+from phasemark.data.plans.arrays import TRUTH, TRUTH_KEYS
 from phasemark.data.plans.frame_plan import TILT, FramePlan
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.data.plans.size import refuse_too_many
@@ -25,9 +25,8 @@ from phasemark.data.scene_job import StoredMesh, read_landmarks
 from phasemark.data.shards.run import produce, refuse_unwritable_output
 from phasemark.render import Background, PhasorImages, Renderer, Views
 from phasemark.render.direct import HistogramImages, HistogramRenderer
+from phasemark.render.view import VIEW_FIELDS
 
-_SUFFIXES = {"m": "_m", "degree": "_deg", "1": ""}
-"""Of the keys of quantities in a plan, by their units in a file."""
 _KEYS = ("class_index", "albedo", "wall_m", "floor_m")
 
 
@@ -175,22 +174,19 @@ class FrameJob(FramesJob[FramePlan]):
             },
         )  # fmt: skip
         for name, array in TRUTH.items():
-            key = f"{name}{_SUFFIXES[array.units]}"
+            key = TRUTH_KEYS[name]
             if key not in TILT or getattr(self.plan, key) is not None:
                 about = {"units": array.units, "long_name": array.long_name}
                 yield name, truth[key].astype(array.kind), array.dims, about
         yield self.split_column(truth["split_index"])
 
-    def images(self, start: int, stop: int) -> tuple[dict[str, NDArray[Any]], PhasorImages | HistogramImages]:
+    def images(self, start: int, stop: int) -> tuple[dict[str, Any], PhasorImages | HistogramImages]:
         """Render some views."""
         truth = self.plan.draw_truth(start, stop)
         image = self._render(truth)
-        stored: dict[str, NDArray[Any]] = {
-            "coverage": image.coverage.astype("<f4"),
-            "range_mixed": image.range_m.astype("<f4"),
-        }
+        stored = {"coverage": image.coverage, "range_mixed": image.range_m}
         if "hard" in self.plan.variants:
-            stored["range_hard"] = self._render(truth, variant="hard").range_m.astype("<f4")
+            stored["range_hard"] = self._render(truth, variant="hard").range_m
         if not self.plan.histograms:
             return stored, image
         parts, order = self._renderings(self._histograms, truth)
@@ -225,22 +221,12 @@ def _alike(truth: dict[str, NDArray[Any]]) -> Iterator[NDArray[np.intp]]:
 
 
 def _views(truth: dict[str, NDArray[Any]]) -> Views:
-    return Views.broadcast(
-        truth["distance_m"],
-        np.deg2rad(truth["delta_deg"]),
-        np.deg2rad(truth["bearing_deg"]),
-        truth["height_m"],
-        np.deg2rad(truth["pitch_deg"]),
-        np.deg2rad(truth["roll_deg"]),
-    )
+    angles = {f"{name}_rad": np.deg2rad(truth[f"{name}_deg"]) for name in ("delta", "bearing", "pitch", "roll")}
+    return Views.broadcast(*((truth | angles)[name] for name in VIEW_FIELDS))
 
 
 def _background(wall_m: float, floor_m: float, plan: FramePlan) -> Background | None:
-    if np.isnan(wall_m) and np.isnan(floor_m):
+    wall, floor = (None if np.isnan(metres) else float(metres) for metres in (wall_m, floor_m))
+    if wall is None and floor is None:
         return None
-    return Background(
-        wall_m=None if np.isnan(wall_m) else float(wall_m),
-        floor_m=None if np.isnan(floor_m) else float(floor_m),
-        wall_albedo=plan.wall_albedo,
-        floor_albedo=plan.floor_albedo,
-    )
+    return Background(wall_m=wall, floor_m=floor, wall_albedo=plan.wall_albedo, floor_albedo=plan.floor_albedo)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import h5py
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.narrow import narrowed
-from phasemark.data.plans.arrays import FRAME_FIELDS, frame_set_fields
+from phasemark.data.plans.arrays import FRAME_FIELDS, TARGET_FIELDS, frame_set_fields
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.data.scene_job import Landmark, SceneJob, attach_scales, make_scale, reserve_array
@@ -25,6 +25,8 @@ from phasemark.render.direct.targets import Status
 P = TypeVar("P", bound=FramePlan | SceneFramesPlan)
 Column = tuple[str, NDArray[Any], tuple[str, ...], dict[str, Any]]
 _FLAGS = tuple(Flag)
+_MEASURED = {"range": "range_m", "amplitude": "amplitude_e", "intensity": "intensity_e", "flags": "flags"}
+"""Datasets of what is measured, also at each frequency, and the attributes of frames that hold it."""
 
 
 class FramesJob(SceneJob[P]):
@@ -58,8 +60,8 @@ class FramesJob(SceneJob[P]):
         """Yield the datasets of views that are written with the header, splits last."""
 
     @abstractmethod
-    def images(self, start: int, stop: int) -> tuple[dict[str, NDArray[Any]], PhasorImages | HistogramImages]:
-        """Return the noise-free arrays of some items in the file, and the images that are captured."""
+    def images(self, start: int, stop: int) -> tuple[dict[str, Any], PhasorImages | HistogramImages]:
+        """Return the noise-free arrays of some items by name, and the images that are captured."""
 
     def lay_out_arrays(self, layout: Layout) -> list[list[Place]]:
         """Write coordinates and truth, and return where the large datasets go."""
@@ -120,20 +122,16 @@ class FramesJob(SceneJob[P]):
         stored, image = self.images(start, stop)
         first = start * self.views_per_item
         frames = self._captured(image, first, stored)
-        stored["range"] = frames.range_m.astype("<f4")
-        stored["flags"] = frames.flags
-        if frames.amplitude_e is not None and frames.intensity_e is not None:
-            stored["amplitude"] = frames.amplitude_e.astype("<f4")
-            stored["intensity"] = frames.intensity_e.astype("<f4")
-        if len(self.sensor.frequencies_hz) > 1:
-            stored |= _of_each_frequency(frames)
-        if frames.taps_e is not None:
-            stored["taps"] = frames.taps_e.astype("<f4")
+        stored["taps"] = frames.taps_e
+        for name, attribute in _MEASURED.items():
+            stored[name] = getattr(frames, attribute)
+            if len(self.sensor.frequencies_hz) > 1:
+                of_each = [getattr(part, attribute) for part in frames.by_frequency]
+                stored[f"frequency_{name}"] = np.stack(of_each, axis=2)
         if self._shot_sensor is not None:
             assert isinstance(image, PhasorImages)
-            shot = capture(image, self._shot_sensor, **self._draws(first))
-            stored["range_shot"] = shot.range_m.astype("<f4")
-        return [stored[name] for name in self.fields]
+            stored["range_shot"] = capture(image, self._shot_sensor, **self._draws(first)).range_m
+        return [stored[name].astype(array.kind, copy=False) for name, array in self._arrays.items()]
 
     def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:
         """Return one item of a file in the form of :meth:`make`."""
@@ -148,18 +146,15 @@ class FramesJob(SceneJob[P]):
         rng = stream(self.plan.seed, "frames.noise", 0)
         return {"rng": rng, "n_frames": self.plan.frames_per_view, "first_view": first_view}
 
-    def _captured(
-        self, image: PhasorImages | HistogramImages, first_view: int, stored: dict[str, NDArray[Any]]
-    ) -> Frames:
+    def _captured(self, image: PhasorImages | HistogramImages, first_view: int, stored: dict[str, Any]) -> Frames:
         """Return noisy frames of views; those of histograms leave these and their targets in `stored`."""
         if isinstance(image, PhasorImages):
             return capture(image, self.sensor, keep_taps=self.plan.keep_taps, **self._draws(first_view))
         frames = capture(image, self.sensor, **self._draws(first_view))
         stored["histogram"] = narrowed(frames.counts, "<u4", "counts")
-        stored["target_distance"] = frames.targets.distance_m.astype("<f4")
-        stored["target_sigma"] = frames.targets.sigma_m.astype("<f4")
-        stored["target_signal"] = frames.targets.signal.astype("<f4")
-        stored["target_status"] = frames.targets.status
+        targets = frames.targets
+        columns = targets.distance_m, targets.sigma_m, targets.signal, targets.status
+        stored |= zip(TARGET_FIELDS, columns, strict=True)
         return frames.ranges
 
     def coordinates(self) -> Iterator[tuple[str, Any, str, str]]:
@@ -169,12 +164,8 @@ class FramesJob(SceneJob[P]):
         yield "frame", np.arange(plan.views * plan.frames_per_view, dtype="<i8"), "1", "frame"
         yield "view", np.arange(plan.views, dtype="<i8"), "1", "view, shown by one frame or more"
         if len(sensor.frequencies_hz) > 1:
-            yield (
-                "frequency",
-                np.array(sensor.frequencies_hz, "<f8"),
-                "Hz",
-                "modulation frequency, in the order of the frame",
-            )
+            hz = np.array(sensor.frequencies_hz, "<f8")
+            yield "frequency", hz, "Hz", "modulation frequency, in the order of the frame"
         if "tap" in dims:
             tau_deg = np.tile(np.arange(4, dtype="<i4") * 90, len(sensor.frequencies_hz))
             yield "phase", tau_deg, "degree", "phase image τ"
@@ -204,30 +195,15 @@ def joined_images(
         Further fields of the images.
     """
 
-    def joined(values: list[NDArray[Any]]) -> NDArray[Any]:
-        return np.concatenate(values)[order]
+    def joined(values: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        return np.concatenate(list(values))[order]
 
     return PhasorImages(
-        phasor=joined([part.phasor for part in parts]),
-        intensity=joined([part.intensity for part in parts]),
-        coverage=joined([part.coverage for part in parts]),
-        sensor=sensor,
-        harmonics={k: joined([part.harmonics[k] for part in parts]) for k in parts[0].harmonics},
-        by_hz={hz: joined([part.by_hz[hz] for part in parts]) for hz in parts[0].by_hz},
+        joined(part.phasor for part in parts),
+        joined(part.intensity for part in parts),
+        joined(part.coverage for part in parts),
+        sensor,
+        harmonics={k: joined(part.harmonics[k] for part in parts) for k in parts[0].harmonics},
+        by_hz={hz: joined(part.by_hz[hz] for part in parts) for hz in parts[0].by_hz},
         **about,
     )
-
-
-def _of_each_frequency(frames: Frames) -> dict[str, NDArray[Any]]:
-    """Return the measurement of each frequency, (n, frames, frequency, rows, cols)."""
-    parts = frames.by_frequency
-
-    def stacked(name: str, kind: str) -> NDArray[Any]:
-        return np.stack([getattr(part, name) for part in parts], axis=2).astype(kind)
-
-    return {
-        "frequency_range": stacked("range_m", "<f4"),
-        "frequency_amplitude": stacked("amplitude_e", "<f4"),
-        "frequency_intensity": stacked("intensity_e", "<f4"),
-        "frequency_flags": stacked("flags", "|u1"),
-    }

@@ -92,7 +92,7 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
             for name, what in (("pose_row", "row"), ("pose_col", "column")):
                 yield name, np.arange(4, dtype="<i4"), "1", f"{what} of a pose"
 
-    def images(self, start: int, stop: int) -> tuple[dict[str, NDArray[Any]], PhasorImages | HistogramImages]:
+    def images(self, start: int, stop: int) -> tuple[dict[str, Any], PhasorImages | HistogramImages]:
         """Generate and render some scenes."""
         scenes, shots = [], []
         for index in range(start, stop):  # a generator may change its meshes from scene to scene
@@ -114,9 +114,7 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
             stored |= {name: np.concatenate([own[name] for own in poses]) for name in POSE_FIELDS}
         for name in self.plan.scenes.labels or {}:
             stored[f"label_{name}"] = np.concatenate([scene.labels[name] for scene in scenes])
-        return {
-            name: values.astype(self._arrays[name].kind) for name, values in stored.items() if name in self._arrays
-        }, image
+        return stored, image
 
     def _rendered(self, placed: PlacedScene, index: int) -> _Shot:
         """Render the steps of a scene."""
@@ -181,15 +179,7 @@ class _Renderers:
 
     def of(self, scene: Scene) -> SceneRenderer:
         """Return a renderer of a scene's bodies, as it was made: what it renders depends on no other scene."""
-        key = tuple(
-            (
-                body.name,
-                *_state(body.mesh),
-                body.albedo if isinstance(body.albedo, float) else id(body.albedo),
-                body.smooth,
-            )
-            for body in scene
-        )
+        key = tuple((body.name, *_state(body.mesh), _albedo(body), body.smooth) for body in scene)
         with self._lock:
             known = self._known.get(key)
         if known is None:
@@ -204,9 +194,9 @@ class _Renderers:
         return own
 
 
-def _albedo(body: Body) -> float | bytes:
-    """Return the albedo of a body, or of its faces."""
-    return body.albedo if isinstance(body.albedo, float) else body.albedo.tobytes()
+def _albedo(body: Body) -> float:
+    """Return the albedo of a body, or which array holds those of its faces."""
+    return body.albedo if isinstance(body.albedo, float) else id(body.albedo)
 
 
 def _state(mesh: SurfaceMesh) -> tuple[int, int]:

@@ -98,6 +98,8 @@ TRUTH = {
     "floor": Array(("view",), "<f8", "m", "how far the floor lies below the lens, NaN if there is none"),
 }
 """True quantities of a view; those of a tilt are absent from files of a level camera."""
+TRUTH_KEYS = {name: name + {"m": "_m", "degree": "_deg", "1": ""}[array.units] for name, array in TRUTH.items()}
+"""Keys of the true quantities in plans and exports."""
 
 
 def bank_frequencies_hz(sensor: Sensor, harmonics: Sequence[int]) -> list[float]:
