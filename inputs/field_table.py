@@ -23,10 +23,15 @@ class FieldTable(BaseModel):
         try:
             super().__init__(**data)
         except ValidationError as error:
-            first = error.errors()[0]
-            if not first["loc"]:  # a finding about several fields names them itself
-                raise UsageError(first["msg"].removeprefix("Value error, ")) from None
-            raise self._refusal(first) from None
+            raise self._refused(error) from None
+
+    @classmethod
+    def _refused(cls, error: ValidationError) -> UsageError:
+        """Put what pydantic finds into a line."""
+        first = error.errors()[0]
+        if not first["loc"]:  # a finding about several fields names them itself
+            return UsageError(first["msg"].removeprefix("Value error, "))
+        return cls._refusal(first)
 
     @classmethod
     def _refusal(cls, first: ErrorDetails) -> UsageError:

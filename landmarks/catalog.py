@@ -41,3 +41,21 @@ def catalog() -> dict[str, LandmarkSpec]:
         "post": Cylinder(radius_m=0.035, height_m=height_m),
     }
     return _Catalog({name: LandmarkSpec(name=name, box=_BOX, upper=upper) for name, upper in uppers.items()})
+
+
+def class_of_catalog(name: str) -> LandmarkSpec:
+    """Return a class of the catalogue that a user names.
+
+    Parameters
+    ----------
+    name : str
+
+    Raises
+    ------
+    UsageError
+        The catalogue does not have it.
+    """
+    known = catalog()
+    if name not in known:
+        raise UsageError(f"unknown class {name!r}: the catalogue has {', '.join(known)}")
+    return known[name]

@@ -29,17 +29,8 @@ PHRASES = {
 }
 """What messages name that is no parameter of the call, and what the command line has for it."""
 _WITH_VALUES = (
-    "amplitude_unit",
-    "board",
-    "content",
-    "fixed",
-    "free",
-    "generator",
-    "quantity",
-    "scheduler",
-    "trusted",
-    "unit",
-)
+    "amplitude_unit", "board", "content", "fixed", "free", "generator", "quantity", "scheduler", "trusted", "unit",
+)  # fmt: skip
 """Parameters that messages name with a value; others may stand in what a user wrote (``--mesh n=part.stl``)."""
 _STATED = rf"(?:({'|'.join(FLAGS)})=(?:…|True\b))"
 _VALUED = rf"(?:({'|'.join(_WITH_VALUES)})=(?=\w)|(part)=(?=\d+/))"

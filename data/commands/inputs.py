@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from trimesh import Trimesh
 
     from phasemark.data import Bank, FrameSet
-    from phasemark.landmarks import LandmarkSpec
     from phasemark.landmarks.mesh import Surface
     from phasemark.render import Background, Renderer, Sensor
     from phasemark.render.integral.surface_mesh import SurfaceMesh
@@ -67,15 +66,17 @@ def read_landmark(name_or_file: str, reading: MeshReading) -> tuple[str, Trimesh
 def class_mesh(name: str) -> Trimesh:
     """Return the mesh of a class of the catalogue."""
     from phasemark.landmarks import build_mesh
+    from phasemark.landmarks.catalog import class_of_catalog
 
-    return build_mesh(_class_spec(name))
+    return build_mesh(class_of_catalog(name))
 
 
 def class_surface(name: str) -> Surface:
     """Return the triangles of a class of the catalogue, which is faster than its mesh."""
+    from phasemark.landmarks.catalog import class_of_catalog
     from phasemark.landmarks.mesh import build_surface
 
-    return build_surface(_class_spec(name))
+    return build_surface(class_of_catalog(name))
 
 
 def class_renderers(sensor: Sensor) -> dict[str, Renderer]:
@@ -84,16 +85,6 @@ def class_renderers(sensor: Sensor) -> dict[str, Renderer]:
     from phasemark.render import Renderer
 
     return {name: Renderer(class_surface(name), sensor, albedo=spec.albedo) for name, spec in catalog().items()}
-
-
-def _class_spec(name: str) -> LandmarkSpec:
-    """Return a class of the catalogue."""
-    from phasemark.landmarks import catalog
-
-    specs = catalog()
-    if name not in specs:
-        raise UsageError(f"unknown class '{name}': the catalogue has {', '.join(specs)}")
-    return specs[name]
 
 
 @dataclass(frozen=True)

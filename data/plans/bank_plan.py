@@ -10,16 +10,14 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
-    BaseModel,
     BeforeValidator,
-    ConfigDict,
     Field,
     PlainSerializer,
     SerializerFunctionWrapHandler,
@@ -33,9 +31,10 @@ from pydantic import (
 from phasemark import PhasemarkError, UsageError
 from phasemark.data.plans.grid_axis import drop_repeated_stop, format_grid, parse_grid
 from phasemark.data.plans.landmark_region import landmark_region, whole_region
-from phasemark.inputs import refuse_truth_values
+from phasemark.inputs.field_table import FieldTable
 from phasemark.inputs.toml_file import read_toml
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog, mesh_symmetry, read_mesh
+from phasemark.landmarks.catalog import class_of_catalog
 from phasemark.landmarks.mesh_files import MeshWarning
 from phasemark.landmarks.symmetry import MAX_SYMMETRY
 from phasemark.render import Sensor, preset
@@ -49,29 +48,12 @@ DEFAULT_DELTA_STEP_DEG = 1.0
 DEFAULT_MARGIN_DEG = 5.0
 
 _YOUNGER_FIELDS = {
-    "lens",
-    "histogram",
-    "lamp_half_angle_deg",
-    "lamp_profile",
-    "bearing_offset_deg",
-    "height_offset_m",
-    "delay_s",
-    "range_shot_std_m",
-    "range_ambient_std_m",
-    "zone_offset_m",
-    "calibration_fields",
-    "calibration_covariance",
-    "systematic_distance_m",
-    "systematic_delta_deg",
-    "systematic_bearing_deg",
-    "systematic_height_m",
-    "systematic_time_s",
-    "overdispersion",
-    "recording_range_m",
-    "recording_pitch_deg",
-    "recording_roll_deg",
+    "lens", "histogram", "lamp_half_angle_deg", "lamp_profile", "bearing_offset_deg", "height_offset_m", "delay_s",
+    "range_shot_std_m", "range_ambient_std_m", "zone_offset_m", "calibration_fields", "calibration_covariance",
+    "systematic_distance_m", "systematic_delta_deg", "systematic_bearing_deg", "systematic_height_m",
+    "systematic_time_s", "overdispersion", "recording_range_m", "recording_pitch_deg", "recording_roll_deg",
     "recording_bearing_deg",
-}
+}  # fmt: skip
 """Of a sensor: what resolved plans in older files lack, and mean 0 or none by."""
 
 _Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$", max_length=100)]
@@ -110,17 +92,28 @@ def without_nul(path: str, info: ValidationInfo) -> str:
     return path
 
 
-class PlanModel(BaseModel):
+class PlanModel(FieldTable):
     """A frozen table of a plan; what is wrong with it is a UsageError of one line."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    @classmethod
+    def _refused(cls, error: ValidationError) -> UsageError:
+        # a key that is misspelt is missing too: naming the misspelling helps more
+        first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
+        if first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
+            return cls._unknown_key(str(first["loc"][0]))
+        own = first.get("ctx", {}).get("error")
+        if isinstance(own, UsageError):
+            key = ".".join(map(str, first["loc"]))
+            return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
+        return cls._refusal(first)
 
-    def __init__(self, **data: Any) -> None:
-        refuse_truth_values(data, type(self).model_fields)
-        try:
-            super().__init__(**data)
-        except ValidationError as error:
-            raise _as_usage_error(error, type(self)) from None
+    @classmethod
+    def _unknown_key(cls, key: str) -> UsageError:
+        """Describe for an unknown key where it belongs, which known key it resembles, or which keys exist."""
+        keys = list(cls.model_fields)
+        similar = difflib.get_close_matches(key, keys, n=1)
+        hint = f"did you mean '{similar[0]}'?" if similar else f"there are {', '.join(keys)}"
+        return UsageError(f"unknown key '{key}': {cls.place_of_key(key) or hint}")
 
     @classmethod
     def place_of_key(cls, key: str) -> str | None:
@@ -137,19 +130,14 @@ class PlanModel(BaseModel):
         return self
 
 
-class _NamesSensor(Protocol):
-    """Fields of a plan that names a sensor, each in its own place among the others."""
-
-    @property
-    def sensor(self) -> str: ...
-    @property
-    def sensor_overrides(self) -> dict[str, Any]: ...
-
-
 class SensorPlan(PlanModel):
-    """A plan with the fields `sensor` and `sensor_overrides`."""
+    """A plan with the fields `sensor` and `sensor_overrides`, each in its own place among the others."""
 
-    def build_sensor(self: _NamesSensor) -> Sensor:
+    if TYPE_CHECKING:
+        sensor: str
+        sensor_overrides: dict[str, Any]
+
+    def build_sensor(self) -> Sensor:
         """Return the sensor, overrides applied.
 
         Raises
@@ -251,7 +239,7 @@ class ScenePlan(SensorPlan, ABC):
         count = len(named) + len(self.landmarks) + len(self.meshes)
         if count > MOST_LANDMARKS:
             raise UsageError(f"a plan can have at most {MOST_LANDMARKS} landmarks, got {count}: make several of it")
-        specs: list[LandmarkSpec] = [*(_from_catalog(name) for name in named), *self.landmarks]
+        specs: list[LandmarkSpec] = [*map(class_of_catalog, named), *self.landmarks]
         names = [*(spec.name for spec in specs), *(mesh.name for mesh in self.meshes)]
         for name in names:
             if names.count(name) > 1 or name == "none":
@@ -540,31 +528,3 @@ def factored_refusal(plan: BankPlan) -> str | None:
     if sensor.lens is not None and sensor.lens.bends_middle_row:
         return "the lens bends the image's middle line (its coefficient p1 is not 0)"
     return None
-
-
-def _from_catalog(name: str) -> LandmarkSpec:
-    known = catalog()
-    if name not in known:
-        raise UsageError(f"unknown class {name!r}: the catalogue has {', '.join(known)}")
-    return known[name]
-
-
-def _as_usage_error(error: ValidationError, model: type[PlanModel]) -> UsageError:
-    # a key that is misspelt is missing too: naming the misspelling helps more
-    first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
-    if first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
-        return _unknown_key(str(first["loc"][0]), model)
-    own = first.get("ctx", {}).get("error")
-    if isinstance(own, UsageError):
-        key = ".".join(map(str, first["loc"]))
-        return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
-    return UsageError.of_field(first["loc"], first["type"], first["msg"], first["input"])
-
-
-def _unknown_key(key: str, model: type[PlanModel]) -> UsageError:
-    """Describe for an unknown key where it belongs, which known key it resembles, or which keys exist."""
-    keys = list(model.model_fields)
-    similar = difflib.get_close_matches(key, keys, n=1)
-    place = model.place_of_key(key)
-    hint = place or (f"did you mean '{similar[0]}'?" if similar else f"there are {', '.join(keys)}")
-    return UsageError(f"unknown key '{key}': {hint}")
