@@ -20,7 +20,6 @@ from phasemark.data.commands.options import (
     Force,
     Json,
     MeshReading,
-    MeshUnitWord,
     Out,
     Resume,
     SensorName,
@@ -120,10 +119,12 @@ def _parsed_region(text: str) -> str | tuple[int, ...]:
 def _mesh_plan(name_and_path: str, reading: MeshReading, symmetry: int | None) -> MeshPlan:
     """Return the plan of a mesh that an option names."""
     from phasemark.data.plans.bank_plan import MeshPlan
+    from phasemark.landmarks import read_mesh
 
     name, path = name_and_file(name_and_path)
-    unit = _stated_unit(path, reading.unit)
-    return MeshPlan(name=name, path=path, unit=unit, up=reading.up, origin=reading.origin, symmetry=symmetry)
+    if reading.unit is None:
+        read_mesh(path, unit=None)  # which says what the extents would be in each
+    return MeshPlan(name=name, path=path, symmetry=symmetry, **vars(reading))
 
 
 def _completed(plan: BankPlan, layout_stated: bool) -> BankPlan:
@@ -180,12 +181,3 @@ def _with_symmetry(meshes: Sequence[MeshPlan], found: Sequence[MeshPlan]) -> tup
             )
         tell(f"note: '{after.name}' {what}; --symmetry N, or 'symmetry' in a plan, overrides this")
     return tuple(one.model_copy(update={"symmetry": other.symmetry}) for one, other in zip(meshes, found, strict=True))
-
-
-def _stated_unit(path: str, unit: MeshUnitWord | None) -> MeshUnitWord | None:
-    """Return the unit, or let the mesh reader say what the extents would be in each."""
-    if unit is None:
-        from phasemark.landmarks import read_mesh
-
-        read_mesh(path, unit=None)
-    return unit

@@ -15,7 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from contextvars import ContextVar
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
 from inspect import Parameter, Signature, getdoc, signature
 from pathlib import Path
@@ -87,14 +87,11 @@ class Shown:
         self.settings = {**settings, "param_decls": flags} if flags else settings
 
 
-@dataclass(frozen=True)
 class Without:
     """Options of a group that a command does not have: ``Annotated[Group, Without("field")]``."""
 
-    names: tuple[str, ...]
-
     def __init__(self, *names: str) -> None:
-        object.__setattr__(self, "names", names)
+        self.names = names
 
 
 def _with_options_of_groups(function: Callable[..., Any]) -> Callable[..., Any]:

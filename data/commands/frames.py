@@ -257,15 +257,8 @@ def frames_simulate(
     delta_deg = view.delta + 40.0 if to_delta is None else to_delta
     way = np.linspace(0.0, 1.0, n_frames) * moving
     views = view.views(view.distance + way * (distance_m - view.distance), view.delta + way * (delta_deg - view.delta))
-    recording = simulate_recording(
-        mesh,
-        readable(name),
-        camera,
-        views,
-        seed=seed,
-        albedo=mesh.metadata.get("albedo", 0.8),
-        background=background_of(wall, floor, bounces),
-    )
+    albedo, background = mesh.metadata.get("albedo", 0.8), background_of(wall, floor, bounces)
+    recording = simulate_recording(mesh, readable(name), camera, views, seed=seed, albedo=albedo, background=background)
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"
     echo(write_recording(recording, out, description=description, force=force))

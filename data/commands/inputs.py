@@ -154,10 +154,10 @@ def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None], *, in_
     from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
 
     for name, distance_m in distances_m.items():
-        described = (
-            None if distance_m is None else sensor.describe_beyond_range(name, distance_m, in_histograms=in_histograms)
-        )
-        if described is not None and distance_m is not None and len(sensor.frequencies_hz) > 1:
+        if distance_m is None:
+            continue
+        described = sensor.describe_beyond_range(name, distance_m, in_histograms=in_histograms)
+        if described is not None and len(sensor.frequencies_hz) > 1:
             divisor_hz = SPEED_OF_LIGHT_M_S / (2 * distance_m)
             raise UsageError(
                 f"{described}; put it nearer, or give 'modulation_hz' = {in_words(sensor.frequencies_hz)} a common"

@@ -25,19 +25,11 @@ def landmark_list(*, as_json: Json = False) -> None:
     if as_json:
         echo_json([spec.model_dump(mode="json") for spec in specs.values()])
         return
-    echo_table(
-        ("class", "box (m)", "upper part", "albedo", "repeats every"),
-        (
-            (
-                name,
-                f"{spec.box.length_m:g} × {spec.box.width_m:g} × {spec.box.height_m:g}",
-                _describe_upper(spec),
-                f"{spec.albedo:g}",
-                f"{360 / spec.symmetry:g}°",
-            )
-            for name, spec in specs.items()
-        ),
-    )
+    rows = []
+    for name, spec in specs.items():
+        box = " × ".join(f"{side_m:g}" for side_m in (spec.box.length_m, spec.box.width_m, spec.box.height_m))
+        rows.append((name, box, _describe_upper(spec), f"{spec.albedo:g}", f"{360 / spec.symmetry:g}°"))
+    echo_table(("class", "box (m)", "upper part", "albedo", "repeats every"), rows)
 
 
 def landmark_show(

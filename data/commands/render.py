@@ -78,14 +78,8 @@ def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: P
 
     from phasemark.render.png import figure_png
 
-    arrays = {
-        "phasor": image.phasor[0],
-        "intensity": image.intensity[0],
-        "coverage": image.coverage[0],
-        "range": image.range_m[0],
-        "unit": "m",
-        "quantity": "range",
-    }
+    arrays = {name: getattr(image, name)[0] for name in ("phasor", "intensity", "coverage")}
+    arrays |= {"range": image.range_m[0], "unit": "m", "quantity": "range"}
     if len(image.sensor.frequencies_hz) > 1:
         arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
     if histograms is not None:

@@ -35,21 +35,15 @@ def sensor_list(*, as_json: Json = False) -> None:
     if as_json:
         echo_json([{"name": name, **sensor.as_dict()} for name, sensor in sensors.items()])
         return
-    echo_table(
-        ("preset", "pixels", "field of view", "modulation", "unambiguous range"),
-        (
-            (
-                name,
-                f"{sensor.rows} × {sensor.cols}",
-                f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°",
-                "direct"
-                if sensor.kind == "direct"
-                else " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz) + " MHz",
-                "" if sensor.kind == "direct" else f"{sensor.unambiguous_range_m:.3f} m",
-            )
-            for name, sensor in sensors.items()
-        ),
-    )
+    rows = []
+    for name, sensor in sensors.items():
+        angles = f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°"
+        modulation, unambiguous = "direct", ""
+        if sensor.kind == "phase":
+            modulation = " + ".join(f"{hz / 1e6:g}" for hz in sensor.frequencies_hz) + " MHz"
+            unambiguous = f"{sensor.unambiguous_range_m:.3f} m"
+        rows.append((name, f"{sensor.rows} × {sensor.cols}", angles, modulation, unambiguous))
+    echo_table(("preset", "pixels", "field of view", "modulation", "unambiguous range"), rows)
 
 
 Frequency = Annotated[
@@ -278,14 +272,11 @@ def sensor_fit(
         if not one.by_frequency:
             raise UsageError(f"{path}: holds unwrapped ranges alone, and a fit takes what each frequency measured")
     measured, base = [one.by_frequency[which] for one in measured], base.by_frequency[which]
+    positions = [one[k : k + 1] for one in measured for k in range(len(one))]  # each position of a file has a distance
     fit = fit_sensor(
-        [one[k : k + 1] for one in measured for k in range(len(one))],  # every position of a file has its distance
-        distance,
-        base=base,
-        albedo=albedo or None,
-        amplitude_unit=amplitude_unit,
+        positions, distance, base=base, albedo=albedo or None, amplitude_unit=amplitude_unit,
         distance_std_m=distance_std or None,
-    )
+    )  # fmt: skip
     write_file(out, fit.to_toml(base_name=readable(sensor)), force)
     if as_json:
         echo_json({"file": str(out), **fit.as_dict()})
