@@ -77,9 +77,7 @@ def _draw_solid(axes: Axes3D, mesh: trimesh.Trimesh, azimuth_deg: float, elevati
         middle, half = (a + b) / 2, 0.55 * (high - low).max()
         getattr(axes, f"set_{name}lim")(middle - half, middle + half)
     axes.set_box_aspect((1, 1, 1))
-    axes.set_xlabel("x' (cm)")
-    axes.set_ylabel("y' (cm)")
-    axes.set_zlabel("z' (cm)")
+    axes.set(xlabel="x' (cm)", ylabel="y' (cm)", zlabel="z' (cm)")
 
 
 def _draw_axis(axes: Axes3D, mesh: trimesh.Trimesh) -> None:
@@ -109,11 +107,9 @@ def _draw_directions(axes: Axes, mesh: trimesh.Trimesh) -> None:
     axes.plot(0, 0, ".", ms=3, color="#1d2733")
     paper = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
     axes.annotate("axis z'", (0, 0), (7, 7), textcoords="offset points", fontsize=9, bbox=paper)
-    axes.set_xlim(-2 * reach, 2 * reach)
-    axes.set_ylim(-2 * reach, 2 * reach)
-    axes.set_aspect("equal")
+    shown = (-2 * reach, 2 * reach)
+    axes.set(xlim=shown, ylim=shown, aspect="equal", xlabel="x' (cm)")
     axes.set_title("from above: δ is the direction in which the camera looks", fontsize=10)
-    axes.set_xlabel("x' (cm)")
     axes.set_ylabel("y' (cm)", labelpad=0)
 
 
@@ -160,10 +156,8 @@ def _base64(values: NDArray[np.generic], kind: type[np.generic]) -> str:
 
 def _direction(azimuth_deg: float, elevation_deg: float) -> NDArray[np.float64]:
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    return np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)],
-        dtype=np.float64,
-    )
+    across = np.cos(elevation)
+    return np.array([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)], dtype=np.float64)
 
 
 def _visible_edges(mesh: trimesh.Trimesh, towards: NDArray[np.float64], closed: bool) -> NDArray[np.float64]:

@@ -99,14 +99,7 @@ def build_mesh(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEF
     """
     import trimesh  # takes a third of a second: what is only rendered does without
 
-    surface = build_surface(spec, part, tolerance_m)
-    return trimesh.Trimesh(
-        vertices=surface.vertices,
-        faces=surface.faces,
-        face_attributes=surface.face_attributes,
-        metadata=surface.metadata,
-        process=False,
-    )
+    return trimesh.Trimesh(**vars(build_surface(spec, part, tolerance_m)), process=False)
 
 
 def build_surface(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = DEFAULT_TOLERANCE_M) -> Surface:

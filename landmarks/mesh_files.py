@@ -148,22 +148,18 @@ def read_mesh(
     vertices, faces = _parse(content, kind, name)
     extents = np.ptp(vertices, axis=0)
     if unit is None:
-        sizes = "; ".join(
-            f"{key}: {' × '.join(f'{value * scale:.4g}' for value in extents)} m"
-            for key, scale in METRES_PER_UNIT.items()
-        )
+        in_units = {
+            key: " × ".join(f"{value * scale:.4g}" for value in extents) for key, scale in METRES_PER_UNIT.items()
+        }
+        sizes = "; ".join(f"{key}: {shown} m" for key, shown in in_units.items())
         raise UsageError(f"{name}: say in which unit it is (unit=…); its extents would be {sizes}")
     vertices = vertices * METRES_PER_UNIT[unit] @ np.array(_UP[up]).T
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     if origin != "file":
         centre = (low + high) / 2
         vertices = vertices - np.array([centre[0], centre[1], low[2] if origin == "base" else centre[2]])
-    mesh = trimesh.Trimesh(
-        vertices=vertices,
-        faces=faces,
-        process=False,
-        metadata={"name": Path(name).stem, "symmetry": 1, "albedo": 0.8},
-    )
+    metadata = {"name": Path(name).stem, "symmetry": 1, "albedo": 0.8}
+    mesh = trimesh.Trimesh(vertices, faces, process=False, metadata=metadata)
     for warning in _doubts(mesh):
         warnings.warn(f"{name}: {warning}", MeshWarning, stacklevel=2)
     return mesh
@@ -259,9 +255,7 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
     except Exception as error:  # whatever a damaged file makes the loader say
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         raise InputFileError(f"{name}: damaged, or not {kind.upper()} ({reason})") from None
-    if not len(faces):
-        raise InputFileError(f"{name}: has no faces")
-    _refuse_too_many(len(faces), name)
+    _check_count(len(faces), name)
     if not np.isfinite(vertices).all():
         index = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
         raise InputFileError(f"{name}: vertex {index} is not finite")
@@ -290,7 +284,10 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
     return vertices[used], faces.reshape(-1, 3)
 
 
-def _refuse_too_many(count: int, name: str) -> None:
+def _check_count(count: int, name: str) -> None:
+    """Refuse a file of no faces, or of more than can be used."""
+    if count <= 0:
+        raise InputFileError(f"{name}: has no faces")
     if count > MAX_FACES:
         raise InputFileError(f"{name}: has {count} faces, at most {MAX_FACES} can be used")
 
@@ -298,23 +295,21 @@ def _refuse_too_many(count: int, name: str) -> None:
 def _check_stl(content: bytes, name: str) -> None:
     declared = struct.unpack_from("<I", content, 80)[0] if len(content) >= 84 else 0
     if len(content) >= 84 and len(content) == 84 + 50 * declared:
-        _refuse_too_many(declared, name)
+        _check_count(declared, name)
         return
     if content.lstrip()[:5].lower() == b"solid":
         text = content.lower()
         facets, loops = text.count(b"facet normal"), text.count(b"endfacet")
         corners = len(re.findall(rb"\bvertex\s", text))
-        if not facets:
-            raise InputFileError(f"{name}: has no faces")
+        _check_count(facets, name)
         if loops != facets or corners != 3 * facets or b"endsolid" not in text:
             raise InputFileError(
                 f"{name}: cut off, or not STL ({facets} facets begin, {loops} end, {corners} vertices)"
             )
-        _refuse_too_many(facets, name)
         return
     if len(content) < 84:
         raise InputFileError(f"{name}: cut off, or not STL ({len(content)} bytes, a header alone has 84)")
-    _refuse_too_many(declared, name)
+    _check_count(max(declared, 1), name)  # one that announces none is of a wrong length all the same
     raise InputFileError(
         f"{name}: cut off, or not STL ({declared} faces need {84 + 50 * declared} bytes, it has {len(content)})"
     )
@@ -326,9 +321,8 @@ def _check_ply(content: bytes, name: str) -> None:
         raise InputFileError(f"{name}: cut off, or not PLY (no header from 'ply' to 'end_header')")
     header = content[:end].decode("ascii", "replace")
     counts = {kind: int(n) for kind, n in re.findall(r"^element\s+(\w+)\s+(\d{1,12})\s*$", header, re.MULTILINE)}
-    if not counts.get("face") or not counts.get("vertex"):
-        raise InputFileError(f"{name}: has no faces")
-    _refuse_too_many(max(counts["face"], counts["vertex"] // 3), name)
+    n_faces, n_vertices = counts.get("face", 0), counts.get("vertex", 0)
+    _check_count(max(n_faces, n_vertices // 3) if n_faces and n_vertices else 0, name)
     if re.search(r"^format\s+ascii", header, re.MULTILINE):
         lines = sum(1 for line in content[end:].splitlines()[1:] if line.strip())
         if lines < sum(counts.values()):
@@ -343,9 +337,7 @@ def _check_off(content: bytes, name: str) -> None:
         n_vertices, n_faces = int(text[1]), int(text[2])
     except (IndexError, ValueError):
         raise InputFileError(f"{name}: cut off, or not OFF (no counts of vertices and faces)") from None
-    if n_faces <= 0 or n_vertices <= 0:
-        raise InputFileError(f"{name}: has no faces")
-    _refuse_too_many(n_faces, name)
+    _check_count(n_faces if n_vertices > 0 else 0, name)
     first, *others = content.splitlines()
     counts = first.split()[1:] or others[0].split()  # some leave out the third, of edges
     if len(text) < 1 + min(len(counts), 3) + 3 * n_vertices + 4 * n_faces:
@@ -391,7 +383,4 @@ def _absolute(corner: bytes, counts: list[int], where: str) -> bytes:
 
 
 def _check_obj(content: bytes, name: str) -> None:
-    faces = len(re.findall(rb"^\s*f\s", content, re.MULTILINE))
-    if not faces:
-        raise InputFileError(f"{name}: has no faces")
-    _refuse_too_many(faces, name)
+    _check_count(len(re.findall(rb"^\s*f\s", content, re.MULTILINE)), name)

@@ -89,8 +89,7 @@ def _curve_figure(name: str, series: tuple[Comparison, ...], found: Characterisa
         ((one.predicted > 0) & (one.simulated > 0)).any() for one in series
     )  # a camera without noise has rounding to show
     if logarithmic:
-        axes.set_xscale("log")
-        axes.set_yscale("log")
+        axes.set(xscale="log", yscale="log")
         positive = np.concatenate([one.simulated[one.simulated > 0] for one in series])
         axes.set_ylim(positive.min() / 3, positive.max() * 3)
     else:
@@ -132,8 +131,7 @@ def _draw_deviations(axes: Axes, series: tuple[Comparison, ...]) -> None:
     axes.axhspan(-1.96, 1.96, color="0.9")
     axes.axhline(0, color="0.5", linewidth=0.8)
     reach = max(4.0, *(float(np.abs(line.get_ydata()).max(initial=0.0)) * 1.1 for line in axes.lines))
-    axes.set_ylim(-reach, reach)
-    axes.set_ylabel("deviation\n(standard errors)")
+    axes.set(ylim=(-reach, reach), ylabel="deviation\n(standard errors)")
     axes.grid(alpha=0.3)
 
 

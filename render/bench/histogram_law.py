@@ -155,12 +155,8 @@ def _plane_light(sensor: Sensor, distance_m: float, zone: int) -> Floats:
     tan_h, tan_v = sensor.tan_half_angles
     u0, v0 = sensor.centre_px
     centre = (2 * tan_h / sensor.cols * (u0 - col - 0.5), 2 * tan_v / sensor.rows * (v0 - row - 0.5))
-    half = [
-        tan / count * scale * fill
-        for tan, count, scale, fill in zip(
-            (tan_h, tan_v), (sensor.cols, sensor.rows), histogram.zone_scale, sensor.fill_factor, strict=True
-        )
-    ]
+    sides = zip((tan_h, tan_v), (sensor.cols, sensor.rows), histogram.zone_scale, sensor.fill_factor, strict=True)
+    half = [tan / count * scale * fill for tan, count, scale, fill in sides]
     blur = histogram.zone_blur
     profiles, tangents = [], []
     midpoints = 160  # along the width and the height of a zone

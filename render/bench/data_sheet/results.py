@@ -37,11 +37,7 @@ def _tail(chi2: float, degrees_of_freedom: int) -> float:
 
 def _agreement(one: Comparison | Characterisation) -> dict[str, float | None]:
     """Return the test of simulated points, for JSON."""
-    return {
-        "chi2": _plain(one.chi2),
-        "degrees_of_freedom": one.degrees_of_freedom,
-        "p_value": _plain(one.p_value),
-    }
+    return {name: _plain(getattr(one, name)) for name in ("chi2", "degrees_of_freedom", "p_value")}
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,12 +21,8 @@ _WIGGLING_ORDERS = ((3, 7), (3,))  # most first; each order is two numbers
 _NOISY_FACTOR = 2.0  # σ of a pixel over that of its neighbours, beside the test of χ²
 _OUTLIER_SIGMAS = 6.0
 _SINE: dict[str, Any] = {
-    "modulation": "sine",
-    "max_harmonic": 49,
-    "harmonics": (),
-    "emitted_pulse": (),
-    "reference_pulse": (),
-}
+    "modulation": "sine", "max_harmonic": 49, "harmonics": (), "emitted_pulse": (), "reference_pulse": (),
+}  # fmt: skip
 
 
 def _range_error_m(phase: Floats, delay: float, harmonics: tuple[Harmonic, ...], sensor: Sensor) -> Floats:
