@@ -23,11 +23,11 @@ from phasemark.data.files.json_text import json_text
 from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.build_frames import FrameJob, frames_job
 from phasemark.data.frames.scene_frames_job import SceneFramesJob
+from phasemark.data.plans.arrays import AnyPlan, planned_size
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.plans.grid_axis import as_count
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
-from phasemark.data.plans.size import AnyPlan, planned_size
 from phasemark.data.progress import Progress
 from phasemark.data.shards.build import Job, Place, difference, make_shard, pieces
 from phasemark.data.shards.run import produce, refuse_unwritable_output
@@ -280,14 +280,12 @@ class MergeJob:
                 raise InputFileError(f"{other.path}: is of another run than {first.path} ({'; '.join(changes[:4])})")
         self._parts = sorted(parts, key=lambda part: part.start)
         reached = 0
-        for part in self._parts:
-            if part.start > reached:
-                raise InputFileError(f"shards are missing: no items {reached} … {part.start - 1} of {first.total}")
-            if part.start < reached:
-                raise InputFileError(f"{part.path}: repeats items from {part.start} on, which another shard has")
-            reached = part.stop
-        if reached < first.total:
-            raise InputFileError(f"shards are missing: no items {reached} … {first.total - 1} of {first.total}")
+        for start, stop, path in [*((part.start, part.stop, part.path) for part in self._parts), (first.total, 0, "")]:
+            if start > reached:
+                raise InputFileError(f"shards are missing: no items {reached} … {start - 1} of {first.total}")
+            if start < reached:
+                raise InputFileError(f"{path}: repeats items from {start} on, which another shard has")
+            reached = stop
         with reading(first.path):
             job = job_of(first.spec)
         if changes := difference(first.identity, json.loads(json.dumps(job.identity()))):
@@ -376,8 +374,5 @@ def _thinned(plan: AnyPlan) -> AnyPlan:
     plan = plan.resolve()
     assert plan.delta_deg is not None
     tried_values = 64
-    fewer = {
-        name: values[:: math.ceil(len(values) / tried_values)]
-        for name, values in (("distance_m", plan.distance_m), ("delta_deg", plan.delta_deg))
-    }
-    return plan.model_copy(update=fewer)
+    grids = {"distance_m": plan.distance_m, "delta_deg": plan.delta_deg}
+    return plan.model_copy(update={key: grid[:: math.ceil(len(grid) / tried_values)] for key, grid in grids.items()})

@@ -25,9 +25,9 @@ from phasemark.data.plans.arrays import (
     GroupName,
     bank_frequencies_hz,
     group_rows,
+    refuse_too_many,
 )
 from phasemark.data.plans.bank_plan import BankPlan, factored_refusal
-from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.scene_job import Landmark, SceneJob, StoredMesh, make_scale, read_landmarks, reserve_array
 from phasemark.data.shards.build import Place
@@ -93,8 +93,6 @@ def build_bank(
     StorageError
         The disk is full or fails.
     """
-    if workers is not None and workers < 1:
-        raise UsageError(f"'workers' must be at least 1, got {workers}")
     if isinstance(plan, Mapping):
         plan = BankPlan(**plan)
     if not isinstance(plan, BankPlan):
@@ -233,13 +231,7 @@ class BankJob(SceneJob[BankPlan]):
             for field, array in IMAGE_ARRAYS.items():
                 of_views = array._replace(dims=(*VIEW_DIMS[name], *array.dims))
                 _, places[name, field] = reserve_array(layout, group, scales, field, of_views, len(VIEW_DIMS[name]))
-        return [
-            [
-                Place(at.offset + slab.first * at.stride, at.stride)
-                for at in (places[slab.group, f] for f in self.fields)
-            ]
-            for slab in self._slabs
-        ]
+        return [[places[slab.group, field].moved(slab.first) for field in self.fields] for slab in self._slabs]
 
     def _coordinates(self, name: GroupName) -> dict[str, tuple[Any, str, str]]:
         """Return values, units and long name of every dimension a group can have."""

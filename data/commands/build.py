@@ -15,7 +15,7 @@ from phasemark.data.commands.options import Building
 from phasemark.data.commands.outputs import refuse_input_files
 
 if TYPE_CHECKING:
-    from phasemark.data.plans.size import AnyPlan
+    from phasemark.data.plans.arrays import AnyPlan
 
 
 NOTED_BYTES = 100_000_000
@@ -25,7 +25,7 @@ NOTED_BYTES = 100_000_000
 def build_or_estimate(build: Callable[..., Any], plan: AnyPlan, out: Path, building: Building) -> None:
     """Build a bank or frame set, whole or in part; or say what that would take."""
     from phasemark.data.partial_outputs import build_part, parse_part
-    from phasemark.data.plans.size import parse_size, planned_size
+    from phasemark.data.plans.arrays import parse_size, planned_size
     from phasemark.data.shards.run import outputs_of
 
     limit = parse_size(building.max_size, "--max-size")
@@ -55,7 +55,7 @@ def build_or_estimate(build: Callable[..., Any], plan: AnyPlan, out: Path, build
 def _echo_estimate(plan: AnyPlan, size: Mapping[str, int], fits: bool, building: Building) -> None:
     """Print how large a build would be, and about how long it would take if it is not too large to be tried."""
     from phasemark.data.partial_outputs import estimate_build
-    from phasemark.data.plans.size import too_many
+    from phasemark.data.plans.arrays import too_many
     from phasemark.data.shards.executor import processors
 
     facts: dict[str, Any] = dict(size)
@@ -73,7 +73,7 @@ def _echo_estimate(plan: AnyPlan, size: Mapping[str, int], fits: bool, building:
 def _note_large(plan: AnyPlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building) -> None:
     """Refuse a file above the limit; say of a large one how large it is and about how long it takes."""
     from phasemark.data.partial_outputs import estimate_build
-    from phasemark.data.plans.size import format_size, refuse_too_many
+    from phasemark.data.plans.arrays import format_size, refuse_too_many
     from phasemark.data.shards.executor import processors
     from phasemark.data.shards.run import refuse_unwritable_output
 

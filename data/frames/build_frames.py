@@ -16,10 +16,9 @@ from phasemark.data.files.same_file import named_files
 from phasemark.data.frames.frame_set_file import FrameSet, open_frames
 from phasemark.data.frames.frames_job import Column, FramesJob, joined_images
 from phasemark.data.frames.scene_frames_job import SceneFramesJob
-from phasemark.data.plans.arrays import TRUTH, TRUTH_KEYS
+from phasemark.data.plans.arrays import TRUTH, TRUTH_KEYS, refuse_too_many
 from phasemark.data.plans.frame_plan import TILT, FramePlan
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
-from phasemark.data.plans.size import refuse_too_many
 from phasemark.data.progress import Progress
 from phasemark.data.scene_job import StoredMesh, read_landmarks
 from phasemark.data.shards.run import produce, refuse_unwritable_output
@@ -89,8 +88,6 @@ def build_frames(
     StorageError
         The disk is full or fails.
     """
-    if workers is not None and workers < 1:
-        raise UsageError(f"'workers' must be at least 1, got {workers}")
     inputs = named_files(plan.model_dump())
     refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     job = frames_job(plan)

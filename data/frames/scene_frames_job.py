@@ -6,6 +6,7 @@ import copy
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +16,9 @@ from trimesh.caching import TrackedArray
 from phasemark import UsageError
 from phasemark.data.frames.frame_set_file import SceneFrameSet
 from phasemark.data.frames.frames_job import Column, FramesJob, joined_images
-from phasemark.data.plans.arrays import POSE_FIELDS, SEQUENCE, sizes_of_scenes
+from phasemark.data.plans.arrays import POSE_FIELDS, SEQUENCE, refuse_too_many, sizes_of_scenes
 from phasemark.data.plans.generated_scene import PlacedScene, class_of_body
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan, SceneSource
-from phasemark.data.plans.size import refuse_too_many
 from phasemark.render import Body, PhasorImages, Scene, SceneRenderer, Sensor
 from phasemark.render.direct import HistogramImages
 from phasemark.render.integral.surface_mesh import SurfaceMesh
@@ -51,14 +51,11 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
         self.shard_items = max(1, _SHARD_VIEWS // plan.scenes.steps)
         super().__init__(plan, plan.build_sensor(), [])
         self._renderers = _Renderers(self.sensor)
-        self._known_source: SceneSource | None = None
 
-    @property
+    @cached_property
     def _source(self) -> SceneSource:
         """What makes the scenes."""
-        if self._known_source is None:
-            self._known_source = self.plan.source()
-        return self._known_source
+        return self.plan.source()
 
     def check_views(self) -> None:
         """Refuse a generator whose scene 0 is not the same when it is made again.

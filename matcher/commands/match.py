@@ -130,7 +130,7 @@ def _positions(
 
 def _direct_positions(file: Path, matcher: Matcher, reading: FrameReading, moving: bool) -> DirectPositions:
     """Return the histograms or targets of a log."""
-    from phasemark.data.plans.size import format_size
+    from phasemark.data.plans.arrays import format_size
     from phasemark.matcher.recordings.direct_positions import read_positions
 
     on, camera = matcher.options["on"], matcher.bank.camera
