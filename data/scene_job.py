@@ -200,43 +200,40 @@ def _doubt_symmetry(part: MeshPlan, mesh: trimesh.Trimesh) -> None:
         return
     stated, found = f"{part.path}: symmetry {part.symmetry} is stated for '{part.name}'", mesh_symmetry(mesh)
     if not has_symmetry(mesh, part.symmetry):
-        warnings.warn(
+        _warn(
             f"{stated}, but turned by {360 / part.symmetry:g}° it differs from itself by more than"
-            f" {1e3 * symmetry_tolerance_m(mesh):.2g} mm; found: {found}",
-            MeshWarning,
-            stacklevel=2,
+            f" {1e3 * symmetry_tolerance_m(mesh):.2g} mm; found: {found}"
         )
     elif found > part.symmetry:
-        warnings.warn(
+        _warn(
             f"{stated}, but turned by {360 / found:g}° it is the same: views that far apart look alike, and no answer"
-            f" about it can be accepted; found: {found}",
-            MeshWarning,
-            stacklevel=2,
+            f" about it can be accepted; found: {found}"
         )
+
+
+def _warn(doubt: str) -> None:
+    warnings.warn(doubt, MeshWarning, stacklevel=3)
 
 
 def _doubt_classes(landmarks: list[Landmark]) -> None:
     """Warn of classes that are the same part."""
     for first, second in itertools.combinations(landmarks, 2):
         if is_same_shape(first.mesh, second.mesh):
-            warnings.warn(
+            _warn(
                 f"'{first.name}' and '{second.name}' look alike from everywhere, and no answer"
-                " about them can be accepted; leave one out",
-                MeshWarning,
-                stacklevel=2,
+                " about them can be accepted; leave one out"
             )
 
 
 def _write_mesh(group: h5py.Group, landmark: Landmark) -> None:
     """Write the mesh of a class into its group."""
-    vertices = group.create_dataset("vertices", data=np.asarray(landmark.mesh.vertices, dtype="<f8"))
-    vertices.attrs["units"] = "m"
-    vertices.attrs["long_name"] = "vertices x', y', z' in the landmark frame"
-    faces = group.create_dataset("faces", data=narrowed(landmark.mesh.faces, "<i4", "vertices of a face"))
+    mesh = landmark.mesh
+    vertices = group.create_dataset("vertices", data=np.asarray(mesh.vertices, dtype="<f8"))
+    vertices.attrs.update({"units": "m", "long_name": "vertices x', y', z' in the landmark frame"})
+    faces = group.create_dataset("faces", data=narrowed(mesh.faces, "<i4", "vertices of a face"))
     faces.attrs["long_name"] = "three vertex indices of each face"
-    if "part" in landmark.mesh.face_attributes:
-        part = group.create_dataset("part", data=narrowed(landmark.mesh.face_attributes["part"], "|u1", "parts"))
+    if "part" in mesh.face_attributes:
+        part = group.create_dataset("part", data=narrowed(mesh.face_attributes["part"], "|u1", "parts"))
         part.attrs["long_name"] = "0 on faces of the lower part, 1 on those of the upper one"
-    group.attrs["delta_period_deg"] = 360 / landmark.symmetry
-    group.attrs["albedo"] = landmark.albedo
-    group.attrs["sha256"] = mesh_sha256(landmark.mesh)
+    about = {"delta_period_deg": 360 / landmark.symmetry, "albedo": landmark.albedo, "sha256": mesh_sha256(mesh)}
+    group.attrs.update(about)

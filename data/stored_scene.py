@@ -123,13 +123,9 @@ class StoredScene:
             raise InputFileError(f"{path}: '{where}' has vertices that are not within 1 km, or not there")
         if part is not None and (part.shape != faces.shape[:1] or part.min() < 0 or part.max() > 1):
             raise InputFileError(f"{path}: '{where}/part' must have one value for each face, 0 or 1")
-        return trimesh.Trimesh(
-            vertices,
-            faces,
-            process=False,
-            face_attributes=None if part is None else {"part": part.astype(np.uint8)},
-            metadata={"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo},
-        )
+        parts: dict[str, Any] | None = None if part is None else {"part": part.astype(np.uint8)}
+        metadata = {"name": class_name, "symmetry": round(360 / period_deg), "albedo": albedo}
+        return trimesh.Trimesh(vertices, faces, process=False, face_attributes=parts, metadata=metadata)
 
 
 S = TypeVar("S", bound=StoredScene)

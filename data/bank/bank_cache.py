@@ -14,8 +14,6 @@ from phasemark.data.bank.build_bank import BankJob, build_bank
 from phasemark.data.plans.bank_plan import BankPlan
 from phasemark.data.progress import Progress
 
-__all__ = ["cached_bank"]
-
 _MOST_BYTES = 1 << 30
 """Banks that were not used for longest are thrown away where all together are larger."""
 

@@ -363,29 +363,20 @@ class Bank(StoredScene):
     def _kind_info(self, group: BankGroup) -> dict[str, Any]:
         """Return how the camera measures; a direct one has no modulation, and the one in its file is the model's."""
         if self.sensor.kind == "phase":
-            return {
-                "harmonics": [k for k in group.order.tolist() if k],
-                "modulation_hz": self.sensor.modulation_hz,
-            }
+            orders = [k for k in group.order.tolist() if k]
+            return {"harmonics": orders, "modulation_hz": self.sensor.modulation_hz}
         histogram = self.sensor.histogram
         names = ("bins", "bin_width_m", "max_targets", "min_separation_m") if histogram is not None else ()
-        return {
-            "kind": self.sensor.kind,
-            "quantity": self.sensor.quantity,
-            "max_range_m": self.sensor.max_range_m,
-            **{name: getattr(histogram, name) for name in names},
-        }
+        stated = {name: getattr(self.sensor, name) for name in ("kind", "quantity", "max_range_m")}
+        return stated | {name: getattr(histogram, name) for name in names}
 
     def _region_info(self) -> dict[str, Any]:
         """Return which pixels of the camera the images hold; nothing where it is every one."""
         if self.region is None:
             return {}
-        region = self.region
-        return {
-            "region": f"rows {region.first_row} … {region.stop_row}, columns {region.first_col} … {region.stop_col}"
-            f" of {self.camera.rows} × {self.camera.cols}",
-            "binning": region.binning,
-        }
+        first_row, stop_row, first_col, stop_col, binning = self.region
+        rows, cols = f"rows {first_row} … {stop_row}", f"columns {first_col} … {stop_col}"
+        return {"region": f"{rows}, {cols} of {self.camera.rows} × {self.camera.cols}", "binning": binning}
 
     def _image(self, field: str, class_name: str, i: int, j: int, hz: float | None = None) -> NDArray[Any]:
         k = self._class_index(class_name)

@@ -40,7 +40,7 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
         )
     meta = folder / "meta"
     meta.mkdir()
-    task = f"{'scenes of ' + str(frames.plan.scenes.generator) if isinstance(frames, SceneFrameSet) else 'landmarks'}"
+    task = f"scenes of {frames.plan.scenes.generator}" if isinstance(frames, SceneFrameSet) else "landmarks"
     features: dict[str, dict[str, Any]] = {}
     first = 0
     with (

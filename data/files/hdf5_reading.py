@@ -57,11 +57,8 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
         if reason is not None:
             raise InputFileError(f"{path}: {reason}")
         if verifying() and not foreign:
-            warnings.warn(
-                f"{path}: has no checksum '{checksum_path(path).name}' beside it, so damage may go unnoticed",
-                UserWarning,
-                stacklevel=2,
-            )
+            beside = checksum_path(path).name
+            warnings.warn(f"{path}: has no checksum '{beside}' beside it, so damage may go unnoticed", stacklevel=2)
     try:
         reason = refusal(path) if foreign else refusal(path, expansion=OWN_EXPANSION, free_bytes=OWN_FREE_BYTES)
     except Exception:  # whatever a damaged file makes h5py say

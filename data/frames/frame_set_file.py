@@ -312,20 +312,14 @@ class FrameSet(StoredScene):
     def frames(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> Frames:
         """Return frames as the matcher takes them, one position each, (n, 1, rows, cols)."""
         sample = self[index]
-        amplitude, intensity = sample.get("amplitude_e"), sample.get("intensity_e")
+        measured = {name: sample[name][:, None] for name in ("amplitude_e", "intensity_e") if name in sample}
         parts = []
         if len(self.sensor.frequencies_hz) > 1:
             for j, camera in enumerate(self.sensor.by_frequency):
                 range_m, amplitude_e, intensity_e, flags = (sample[_key(name)][:, None, j] for name in FREQUENCY_FIELDS)
                 parts.append(Frames(range_m, amplitude_e, intensity_e, flags=flags, sensor=camera))
-        return Frames(
-            sample["range_m"][:, None],
-            None if amplitude is None else amplitude[:, None],
-            None if intensity is None else intensity[:, None],
-            flags=sample["flags"][:, None],
-            sensor=self.sensor,
-            by_frequency=parts,
-        )
+        range_m, flags = sample["range_m"][:, None], sample["flags"][:, None]
+        return Frames(range_m, **measured, flags=flags, sensor=self.sensor, by_frequency=parts)
 
     def histograms(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> HistogramFrames:
         """Return histograms of frames, one position each, (n, 1, rows, cols, bins).
@@ -336,8 +330,7 @@ class FrameSet(StoredScene):
             The frame set holds no histograms.
         """
         self._refuse_without("histograms", self.holds_histograms)
-        counts = self._numbered("histogram", index)
-        return HistogramFrames(counts[:, None], sensor=self.sensor)
+        return HistogramFrames(self._numbered("histogram", index)[:, None], sensor=self.sensor)
 
     def targets(self, index: slice | Sequence[int] | NDArray[np.integer] = slice(None)) -> Targets:
         """Return the stored targets of frames, one position each, (n, 1, rows, cols, targets).
@@ -371,13 +364,11 @@ class FrameSet(StoredScene):
     def _refuse_without(self, what: str, there: bool) -> None:
         if there:
             return
-        why = (
-            f"build it with '{what}' in 'keep'"
-            if isinstance(self.plan, SceneFramesPlan)
-            else "build it without 'histograms = false'"
-        )
-        no_table = self.sensor.histogram is None
-        raise UsageError(f"{self.path} holds no {what}: {'its sensor has no [histogram] table' if no_table else why}")
+        of_scenes = isinstance(self.plan, SceneFramesPlan)
+        why = f"build it with '{what}' in 'keep'" if of_scenes else "build it without 'histograms = false'"
+        if self.sensor.histogram is None:
+            why = "its sensor has no [histogram] table"
+        raise UsageError(f"{self.path} holds no {what}: {why}")
 
     def view(self, number: int) -> Frames:
         """Return all frames of one view, (1, frames_per_view, rows, cols).
@@ -458,13 +449,16 @@ class FrameSet(StoredScene):
     def _truth_info(self) -> dict[str, Any]:
         """Return a summary of the views in plain numbers and text."""
         of_class = np.bincount(self.truth["class_index"], minlength=len(self.classes))
-        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
         distance_m = self.truth["distance_m"]
         return {
             "views_of_class": dict(zip(self.classes, of_class.tolist(), strict=True)),
-            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
+            "views_of_split": self._views_of_split(),
             "distance_m": [float(distance_m.min()), float(distance_m.max())],
         }
+
+    def _views_of_split(self) -> dict[str, int]:
+        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
+        return dict(zip(self.splits, of_split.tolist(), strict=True))
 
 
 class SceneFrameSet(FrameSet):
@@ -510,14 +504,13 @@ class SceneFrameSet(FrameSet):
         return {name: values[views] for name, values in self.truth.items()}
 
     def _truth_info(self) -> dict[str, Any]:
-        of_split = np.bincount(self.truth["split_index"], minlength=len(self.splits))
         return {
             "scenes": self.plan.n_scenes,
             "steps": self.plan.scenes.steps,
             "generator": self.plan.scenes.generator or f"{len(self.plan.scenes.list)} files",
             "classes": list(self.classes),
             "labels": [name.removeprefix("label_") for name in self.truth if name.startswith("label_")],
-            "views_of_split": dict(zip(self.splits, of_split.tolist(), strict=True)),
+            "views_of_split": self._views_of_split(),
         }
 
     def identity(self) -> dict[str, Any]:

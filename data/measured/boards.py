@@ -164,7 +164,6 @@ def read_board_log(file: BinaryIO, board: Board, sensor: Sensor, shape: tuple[in
         warnings.warn(
             f"{path}: left out {log.n_damaged} of {log.n_damaged + n_frames} frames, which are incomplete or garbled,"
             f" the first at {log.first_damage}",
-            UserWarning,
             stacklevel=2,
         )
     for name, values, expected in (("status", status, len(distance)), ("time", times, n_frames)):

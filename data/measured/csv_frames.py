@@ -202,9 +202,7 @@ def _note_ignored(names: list[str], used: list[int], path: Path) -> None:
     ignored = [name for name in ignored if not _OUR_OWN.fullmatch(name)]
     if ignored:
         more = f" and {len(ignored) - _MOST_NAMED} more" if len(ignored) > _MOST_NAMED else ""
-        warnings.warn(
-            f"{path}: ignores the columns {', '.join(ignored[:_MOST_NAMED])}{more}", UserWarning, stacklevel=2
-        )
+        warnings.warn(f"{path}: ignores the columns {', '.join(ignored[:_MOST_NAMED])}{more}", stacklevel=2)
 
 
 def _numbers(body: _Text, columns: Sequence[int]) -> NDArray[np.float64]:

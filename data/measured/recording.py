@@ -88,9 +88,7 @@ def note_disorder(times: NDArray[np.float64], path: Path, place: Callable[[int],
     counts = " and ".join(f"{count} of {len(times)} time stamps {what}" for count, what in found if count)
     if counts:
         first = int(np.flatnonzero(steps <= 0)[0]) + 1
-        warnings.warn(
-            f"{path}: {counts}, the first in {place(first)}; the frames keep their order", UserWarning, stacklevel=2
-        )
+        warnings.warn(f"{path}: {counts}, the first in {place(first)}; the frames keep their order", stacklevel=2)
 
 
 @contextmanager

@@ -5,8 +5,6 @@ from __future__ import annotations
 import html
 from collections.abc import Iterable, Mapping, Sequence
 
-__all__ = ["facts_html", "table_html"]
-
 
 def table_html(header: Sequence[str], rows: Iterable[Sequence[object]], *, caption: str = "") -> str:
     """Return a table as HTML; every text is escaped.

@@ -21,13 +21,8 @@ def page_template(package: str, name: str) -> jinja2.Template:
     Its filter ``number`` is :func:`short_number`, and ``anchor`` makes the name of a heading that links lead to.
     ``macros.html.j2`` has the parts that pages share.
     """
-    environment = jinja2.Environment(
-        loader=jinja2.ChoiceLoader(
-            [jinja2.PackageLoader(package, "."), jinja2.PackageLoader("phasemark.data.pages", ".")]
-        ),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-    )
+    loader = jinja2.ChoiceLoader([jinja2.PackageLoader(one, ".") for one in (package, "phasemark.data.pages")])
+    environment = jinja2.Environment(loader=loader, autoescape=True, undefined=jinja2.StrictUndefined)
     environment.filters["number"] = short_number
     environment.filters["anchor"] = _anchor
     return environment.get_template(name)

@@ -385,8 +385,7 @@ class BankPlan(ScenePlan):
         if self.region == "whole":
             region = whole_region(sensor, self.binning)
         elif self.region == "landmark":
-            shapes = [build_mesh(spec) for spec in specs]
-            shapes += [part.read() for part in meshes]
+            shapes = [*map(build_mesh, specs), *(part.read() for part in meshes)]
             margin_rad = math.radians(self.margin_deg)
             region = landmark_region(sensor, shapes, self.distance_m, self.binning, margin_rad)
         else:

@@ -347,8 +347,7 @@ class FramePlan(ScenePlan):
 
     def landmark_names(self) -> list[str]:
         """Return the names of the classes of a resolved plan, in the order of their numbers."""
-        parts: list[LandmarkSpec | MeshPlan] = [*self.landmarks, *self.meshes]
-        return [part.name for part in parts]
+        return [*(spec.name for spec in self.landmarks), *(mesh.name for mesh in self.meshes)]
 
     def draw_truth(self, start: int = 0, stop: int | None = None) -> dict[str, NDArray[Any]]:
         """Return the truth of some views of a resolved plan; that of a view depends on seed and number alone.
@@ -383,9 +382,7 @@ class FramePlan(ScenePlan):
     def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:
         from scipy.stats import qmc  # slow to import
 
-        names = [
-            name for name in QUANTITIES if (spread := getattr(self, name)) is not None and spread.sobol is not None
-        ]
+        names = [name for name in QUANTITIES if getattr(getattr(self, name), "sobol", None) is not None]
         if not names:
             return {}
         seed = int(stream(self.seed, "frames.sobol", 0).integers(2**63))  # SciPy spawns from it, which Philox cannot

@@ -78,14 +78,9 @@ class PlacedScene:
         """Return True if bodies, poses and labels are equal."""
 
         def bodies(placed: PlacedScene) -> list[tuple[Any, ...]]:
-            found = placed.scene or ()
-            return [
-                (
-                    *(body.name, body.retroreflecting, body.specular, body.shininess),
-                    *(np.asarray(body.albedo).tobytes(), body.mesh.vertices.tobytes()),
-                )
-                for body in found
-            ]
+            arrays = [(np.asarray(one.albedo).tobytes(), one.mesh.vertices.tobytes()) for one in placed.scene or ()]
+            lights = [(one.name, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()]
+            return [*lights, *arrays]
 
         return (
             bodies(self) == bodies(other)
@@ -179,9 +174,7 @@ def placed(found: GeneratedScene, index: int, steps: int, labels: Mapping[str, s
         if len(cameras) not in (1, steps):
             raise UsageError(f"'camera2world' has {len(cameras)} poses for 'steps' = {steps}")
         cameras = np.repeat(cameras, steps, axis=0) if len(cameras) < steps else cameras
-        bodies = np.zeros((steps, 0, 4, 4))
-        if found.scene is not None:
-            bodies = found.scene.posed(found.bodies2world, steps)
+        bodies = np.zeros((steps, 0, 4, 4)) if found.scene is None else found.scene.posed(found.bodies2world, steps)
         own = {name: _label(name, values, steps) for name, values in dict(found.labels).items()}
         if labels is not None:
             _check_labels(own, labels)

@@ -53,13 +53,8 @@ def landmark_region(
     if not _pixels_within(sensor, low, high).any():
         raise UsageError("'region' must be 'whole' or four numbers here: no landmark is in view at any distance")
     seen = _pixels_within(sensor, np.tan(np.arctan(low) - margin_rad), np.tan(np.arctan(high) + margin_rad))
-    rows, cols = (
-        _whole_blocks(first, stop, size, centre, binning)
-        for (first, stop), size, centre in (
-            (_extent(np.asarray(seen.any(axis=1))), sensor.rows, sensor.centre_px[1]),
-            (_extent(np.asarray(seen.any(axis=0))), sensor.cols, sensor.centre_px[0]),
-        )
-    )
+    rows = _whole_blocks(*_extent(seen, 1), sensor.rows, sensor.centre_px[1], binning)
+    cols = _whole_blocks(*_extent(seen, 0), sensor.cols, sensor.centre_px[0], binning)
     return Region(*rows, *cols, binning)
 
 
@@ -101,9 +96,9 @@ def _pixels_within(sensor: Sensor, low: NDArray[np.float64], high: NDArray[np.fl
     return np.asarray(((corners.max(axis=0) > low) & (corners.min(axis=0) < high)).all(axis=-1))
 
 
-def _extent(seen: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return first and stop of what is true."""
-    where = np.flatnonzero(seen)
+def _extent(seen: NDArray[np.bool_], axis: int) -> tuple[int, int]:
+    """Return first and stop of what is true anywhere along an axis."""
+    where = np.flatnonzero(seen.any(axis=axis))
     return int(where[0]), int(where[-1]) + 1
 
 

@@ -255,9 +255,8 @@ class SceneFramesPlan(SensorPlan):
             labels = {name: kind_of_label(values) for name, values in source.placed(0).labels.items()}
             stated = {"n": self.n_scenes, "labels": labels, "source_sha256": source.sha256}
             scenes = scenes.model_copy(update=stated)
-        absent = {
-            "histograms": sensor.histogram is None, "targets": sensor.histogram is None, "shares": not scenes.classes,
-        }  # fmt: skip
+        no_table = sensor.histogram is None
+        absent = {"histograms": no_table, "targets": no_table, "shares": not scenes.classes}
         return self.model_copy(
             update={
                 "scenes": scenes,
