@@ -118,7 +118,6 @@ def rebuild_bank(
     delta_deg: Sequence[float],
     classes: Sequence[str] | None = None,
     sensor: Sensor | None = None,
-    workers: int | None = None,
 ) -> Bank:
     """Build a bank of the same landmarks on another grid, or for another camera, in a temporary file.
 
@@ -132,8 +131,6 @@ def rebuild_bank(
         Which of its landmarks; None: all.
     sensor : Sensor, optional
         The new camera; None: the bank's own.
-    workers : int, optional
-        As for :func:`build_bank`.
 
     Returns
     -------
@@ -162,7 +159,7 @@ def rebuild_bank(
     with TemporaryDirectory(prefix="phasemark-") as folder:
         path = Path(folder) / "bank.h5"
         job = BankJob(plan, bank.mesh)
-        produce(job, path, finished=job.finished_identity, workers=workers)
+        produce(job, path, finished=job.finished_identity)
         return open_bank(path)
 
 

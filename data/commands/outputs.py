@@ -27,23 +27,17 @@ def refuse_input_files(outputs: Iterable[Path], plan: BaseModel | None = None) -
 
 @contextmanager
 def output_folder(
-    folder: Path,
-    command: str,
-    names: Sequence[str],
-    force: bool,
-    plan: BaseModel | None = None,
-    *,
-    also: Sequence[str] = (),
+    folder: Path, command: str, names: Sequence[str], force: bool, plan: BaseModel | None = None
 ) -> Iterator[None]:
     """Lock a folder while a command writes files into it; a file that another program wrote is not replaced.
 
-    `names` must not exist unless they are ours and `force` is set; `also` are ours too, and looked at by their writer.
+    `names` must not exist unless they are ours and `force` is set.
     """
     from phasemark.data.files.folder_marker import adding_to_folder
 
     refuse_existing([folder / name for name in names], force, plan)
     with adding_to_folder(folder, command) as ours:
-        ours.claim(*names, *also)
+        ours.claim(*names)
         yield
 
 

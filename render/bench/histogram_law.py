@@ -86,8 +86,8 @@ def plane_counts(sensor: Sensor, distance_m: float, albedo: float) -> Floats:
     return counts
 
 
-def target_counts(sensor: Sensor, range_m: float, intensity: float, zone: int = 0) -> Floats:
-    """Return the expected counts of a zone that sees one range alone, (bins,).
+def target_counts(sensor: Sensor, range_m: float, intensity: float) -> Floats:
+    """Return the expected counts of zone 0 if it sees one range alone, (bins,).
 
     Parameters
     ----------
@@ -95,10 +95,9 @@ def target_counts(sensor: Sensor, range_m: float, intensity: float, zone: int = 
     range_m : float
     intensity : float
         1 for albedo 1 facing the sensor at 1 m.
-    zone : int
     """
     histogram = histogram_of(sensor)
-    shares = np.diff(cumulative_response(bin_edges_m(sensor, zone) - range_m, sensor, zone))
+    shares = np.diff(cumulative_response(bin_edges_m(sensor, 0) - range_m, sensor, 0))
     light = intensity * (1 + histogram.stray) * (histogram.zone_gain[0][0] if histogram.zone_gain else 1.0)
     return detected(histogram.cycles * histogram.photons * light * shares, sensor)
 
