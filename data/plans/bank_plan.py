@@ -7,7 +7,7 @@ import math
 import os
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
@@ -247,6 +247,11 @@ class ScenePlan(SensorPlan, ABC):
                 raise UsageError(f"the class name {name!r} {problem}: give each landmark a name of its own")
         return specs, list(self.meshes)
 
+    def _resolved(self, specs: Iterable[LandmarkSpec], meshes: Iterable[MeshPlan], sensor: Sensor, **own: Any) -> Self:
+        """Return the plan with landmarks and sensor spelled out, and some of its own fields replaced."""
+        shown = {"classes": (), "landmarks": tuple(specs), "meshes": tuple(meshes)}
+        return self.model_copy(update={**shown, "sensor_overrides": sensor.model_dump(mode="json"), **own})
+
 
 def find_symmetries(meshes: Sequence[MeshPlan]) -> list[MeshPlan]:
     """Return landmarks from mesh files, each with its symmetry: that stated, or else that of the mesh.
@@ -363,17 +368,10 @@ class BankPlan(ScenePlan):
         meshes = find_symmetries(meshes)
         period_deg = 360 / common_symmetry([*specs, *meshes])
         delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
-        return self.model_copy(
-            update={
-                "classes": (),
-                "landmarks": tuple(specs),
-                "meshes": tuple(meshes),
-                "sensor_overrides": self.build_sensor().model_dump(mode="json"),
-                "delta_deg": tuple(drop_repeated_stop(delta_deg, period_deg).tolist()),
-                "albedo": None,
-                "region": self._resolved_region(specs, meshes),
-            }
-        )
+        return self._resolved(
+            specs, meshes, self.build_sensor(), albedo=None, region=self._resolved_region(specs, meshes),
+            delta_deg=tuple(drop_repeated_stop(delta_deg, period_deg).tolist()),
+        )  # fmt: skip
 
     def _resolved_region(
         self, specs: Sequence[LandmarkSpec], meshes: Sequence[MeshPlan]

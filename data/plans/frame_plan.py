@@ -324,16 +324,10 @@ class FramePlan(ScenePlan):
         if self.histograms and sensor.histogram is None:
             raise UsageError("'histograms' must be left out: the sensor has no [histogram] table")
         order: tuple[Variant, ...] = ("hard", "mixed", "shot")
-        return self.model_copy(
-            update={
-                "classes": (),
-                "landmarks": tuple(specs),
-                "meshes": tuple(find_symmetries(meshes)),
-                "sensor_overrides": sensor.model_dump(mode="json"),
-                "variants": tuple(name for name in order if name in self.variants),
-                "histograms": True if self.has_histograms else self.histograms,
-            }
-        )
+        return self._resolved(
+            specs, find_symmetries(meshes), sensor, variants=tuple(name for name in order if name in self.variants),
+            histograms=True if self.has_histograms else self.histograms,
+        )  # fmt: skip
 
     @property
     def has_histograms(self) -> bool:
