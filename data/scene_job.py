@@ -6,7 +6,7 @@ import itertools
 import json
 import math
 import warnings
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from phasemark.data.files.narrow import narrowed
 from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.plans.arrays import Array
 from phasemark.data.plans.bank_plan import MeshPlan, PlanModel
-from phasemark.data.shards.build import Place
+from phasemark.data.shards.build import Job, Place
 from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.landmarks import LandmarkSpec, build_mesh, mesh_symmetry
 from phasemark.landmarks.mesh_files import MeshWarning
@@ -47,7 +47,7 @@ class Landmark:
 P = TypeVar("P", bound=PlanModel)
 
 
-class SceneJob(ABC, Generic[P]):
+class SceneJob(Job, Generic[P]):
     """A bank or a frame set to be built (:class:`phasemark.data.shards.build.Job`).
 
     Parameters
@@ -118,11 +118,6 @@ class SceneJob(ABC, Generic[P]):
         """Return further attributes of the file."""
         return {}
 
-    @property
-    @abstractmethod
-    def items(self) -> list[int]:
-        """How many items each slab has."""
-
     @abstractmethod
     def check_views(self) -> None:
         """Refuse a plan with views that cannot be rendered, before any is.
@@ -136,10 +131,6 @@ class SceneJob(ABC, Generic[P]):
     @abstractmethod
     def lay_out_arrays(self, layout: Layout) -> list[list[Place]]:
         """Write all but meshes into a layout, and return for each slab where its large arrays go."""
-
-    @abstractmethod
-    def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
-        """Render some items of a slab."""
 
     @abstractmethod
     def read(self, file: h5py.File, slab: int, item: int) -> dict[str, NDArray[Any]]:

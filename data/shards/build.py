@@ -267,14 +267,10 @@ class _Run:
         descriptor, fresh = lock_file(partial_path(path), path)
         run = cls(path, descriptor)
         run._worth_keeping = not fresh
+        ours = [run.partial]
         try:
             run._refuse_foreign(fresh)
-        except BaseException:
-            if fresh:
-                run.partial.unlink(missing_ok=True)
-            os.close(descriptor)
-            raise
-        try:
+            ours.append(run.manifest)
             for target in (path, checksum_path(path)):  # another run may have finished before the lock was ours
                 refuse_unwritable(target, force=force)
             yield run
@@ -282,7 +278,7 @@ class _Run:
             if run._log >= 0:
                 os.close(run._log)
             if not run._worth_keeping:
-                for leftover in (run.partial, run.manifest):  # a partial file without a manifest is empty
+                for leftover in ours:  # a partial file without a manifest is empty
                     with suppress(OSError):
                         leftover.unlink(missing_ok=True)
             os.close(descriptor)  # and with it the lock
