@@ -96,6 +96,24 @@ def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
     return content
 
 
+def first_bytes(path: str | os.PathLike[str], size: int) -> bytes:
+    """Return the beginning of a file, and nothing of a pipe or of a file that cannot be read.
+
+    Parameters
+    ----------
+    path : path-like
+    size : int
+        Number of bytes; a shorter file is returned whole.
+    """
+    try:
+        if stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
+            with open(path, "rb") as file:
+                return file.read(size)
+    except (OSError, ValueError):
+        pass
+    return b""
+
+
 def read_text(path: str | os.PathLike[str], *, most_bytes: int) -> str:
     """Return a text file's content, UTF-8 with or without a byte order mark, read as :func:`read_whole` does.
 

@@ -72,10 +72,9 @@ def render_frame(
 
 def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: Path, data: Path, force: bool) -> None:
     """Write the figure of an image, or of its histograms where there are any, and the arrays."""
-    import io
-
     import numpy as np
 
+    from phasemark.data.measured.recording import npz_bytes
     from phasemark.render.png import figure_png
 
     arrays = {name: getattr(image, name)[0] for name in ("phasor", "intensity", "coverage")}
@@ -84,8 +83,6 @@ def _write_image(image: PhasorImages, histograms: HistogramImages | None, out: P
         arrays |= {"frequency": np.array(image.sensor.frequencies_hz), "frequency_phasor": image.phasors[0]}
     if histograms is not None:
         arrays |= {"expected_counts": histograms.expected[0], "signal_counts": histograms.signal[0]}
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
     figure = figure_png((image if histograms is None else histograms).plot(), dpi=120)
-    write_file(data, buffer.getvalue(), force)
+    write_file(data, npz_bytes(arrays), force)
     write_file(out, figure, force)

@@ -16,6 +16,7 @@ from phasemark.data.export.card import Column, write_card
 from phasemark.data.export.samples import BLOCK, truth_rows
 from phasemark.data.frames.frame_set_file import FrameSet, Sample
 from phasemark.data.measured.reading import RangeOrZ
+from phasemark.data.measured.recording import npz_bytes
 from phasemark.inputs import sha256_of
 
 SAMPLES = 4096
@@ -34,7 +35,7 @@ def write_webdataset(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None
             path = folder / f"{split}-{shard:06d}.tar"
             with tarfile.open(path, "w", format=tarfile.USTAR_FORMAT) as tar:
                 for number, arrays, truth in _samples(frames, numbers[start : start + SAMPLES]):
-                    _add(tar, f"{number:08d}.npz", _npz(arrays))
+                    _add(tar, f"{number:08d}.npz", npz_bytes(arrays))
                     _add(tar, f"{number:08d}.json", (json.dumps(truth, ensure_ascii=False) + "\n").encode())
             files.append({"name": path.name, "format": "application/x-tar", "sha256": sha256_of(path)})
     sample = frames[:1]
@@ -50,12 +51,6 @@ def _samples(frames: FrameSet, numbers: NDArray[np.int64]) -> Iterator[tuple[int
         sample = frames[chosen]
         for k, truth in enumerate(truth_rows(frames, sample)):
             yield int(chosen[k]), {key: sample[key][k] for key in frames.arrays}, {"frame": int(chosen[k]), **truth}
-
-
-def _npz(arrays: Sample) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)
-    return buffer.getvalue()
 
 
 def _add(tar: tarfile.TarFile, name: str, content: bytes) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, overload
@@ -35,7 +34,8 @@ from phasemark.data.plans.frame_plan import FramePlan
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan
 from phasemark.data.stored_scene import StoredScene, open_scene
 from phasemark.inputs.numbers import in_words
-from phasemark.render import Frames, Sensor
+from phasemark.inputs.reading import first_bytes
+from phasemark.render import Frames
 from phasemark.render.direct import HistogramFrames, Targets
 
 _SUFFIXES = {"m": "_m", "e-": "_e", "degree": "_rad", "1": ""}
@@ -135,7 +135,8 @@ class FrameSet(StoredScene):
 
     def _read_plan(self, plan: dict[str, Any]) -> None:
         """Take the plan, and the names of the classes."""
-        self.plan = FramePlan(**_with_histograms_stated(plan, self.sensor))
+        # a file's plan that does not mention histograms was written before there were any
+        self.plan = FramePlan(**(plan if self.sensor.histogram is None else {"histograms": False, **plan}))
         self.classes = tuple(self.plan.landmark_names())
 
     def _wanted(self, file: h5py.File) -> dict[str, Array]:
@@ -234,13 +235,8 @@ class FrameSet(StoredScene):
             if not -n <= index < n:
                 raise IndexError(f"frame {index} of {n}")
             numbers = np.array([int(index) % n])
-        elif isinstance(index, slice):
-            numbers = np.arange(len(self))[index]
         else:
-            numbers = np.asarray(index)
-            if numbers.dtype == bool:
-                numbers = np.flatnonzero(numbers)
-            numbers = np.arange(len(self))[numbers]
+            numbers = self._places(index)
         views = self.view_index[numbers]
         sample: Sample = {}
         for name in self._fields:
@@ -344,10 +340,13 @@ class FrameSet(StoredScene):
         distance_m, sigma_m, signal, status = (self._numbered(name, index)[:, None] for name in TARGET_FIELDS)
         return Targets(distance_m.astype(float), sigma_m.astype(float), signal.astype(float), status)
 
+    def _places(self, index: slice | Sequence[int] | NDArray[np.integer]) -> NDArray[np.intp]:
+        """Return the numbers of some frames, from 0."""
+        return np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
+
     def _numbered(self, name: str, index: slice | Sequence[int] | NDArray[np.integer]) -> NDArray[Any]:
         """Return one dataset of some frames."""
-        numbers = np.arange(len(self))[index if isinstance(index, slice) else np.asarray(index)]
-        return self._checked(name, self._take(name, numbers))
+        return self._checked(name, self._take(name, self._places(index)))
 
     def reported_quantity(self) -> Literal["range", "z"]:
         """Return the quantity that the chip reports as the distance of targets.
@@ -558,11 +557,6 @@ class FrameSubset:
         return sample if self.transform is None else self.transform(sample)
 
 
-def _with_histograms_stated(plan: dict[str, Any], sensor: Sensor) -> dict[str, Any]:
-    """Return a file's plan; one that does not mention histograms was written before there were any."""
-    return plan if sensor.histogram is None else {"histograms": False, **plan}
-
-
 def _key(name: str) -> str:
     """Return the key of a sample that holds a dataset of the file."""
     return f"{name}{_SUFFIXES[{**FIELDS, **TRUTH}[name].units]}"
@@ -604,12 +598,5 @@ def is_frame_set(path: str | os.PathLike[str]) -> bool:
     bool
         False also if the file cannot be read.
     """
-    try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
-            return False
-        with open(path, "rb") as file:
-            if file.read(8) != b"\x89HDF\r\n\x1a\n":
-                return False
-            return FrameSet.FORMAT.encode() in file.read(1 << 16)
-    except OSError:
-        return False
+    start = first_bytes(path, 1 << 16)
+    return start.startswith(b"\x89HDF\r\n\x1a\n") and FrameSet.FORMAT.encode() in start

@@ -7,7 +7,6 @@ import json
 import math
 import os
 import re
-import stat
 import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from phasemark import InputFileError, PhasemarkError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
 from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, opened_npz
-from phasemark.inputs.reading import read_whole
+from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Status, Targets
@@ -64,16 +63,13 @@ def is_histogram_log(path: str | os.PathLike[str]) -> bool:
     bool
         False also if the file cannot be read.
     """
+    start = first_bytes(path, HEAD_BYTES)
+    if not start.startswith(b"PK\x03\x04"):
+        start = start.lstrip()
+        return start.startswith(b"{") and not JSON.match(start.decode(errors="replace"))
     try:
-        if not stat.S_ISREG(os.stat(path).st_mode):  # bytes read from a pipe are gone for the next reader
-            return False
-        with open(path, "rb") as file:
-            if file.read(4) != b"PK\x03\x04":
-                file.seek(0)
-                start = file.read(HEAD_BYTES).lstrip()
-                return start[:1] == b"{" and not JSON.match(start.decode(errors="replace"))
-            with zipfile.ZipFile(file) as archive:
-                names = archive.namelist()
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
         return "histogram.npy" in names and "range.npy" not in names
     except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
         return False

@@ -30,6 +30,7 @@ from phasemark.data.measured.recording import (
     TILTS,
     Recording,
     note_disorder,
+    npz_bytes,
     one_time,
     opened_npz,
 )
@@ -443,9 +444,7 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
         arrays[SECONDS] = frames.time_s
     if frames.tilt_rad is not None:
         arrays |= dict(zip(TILTS, np.moveaxis(np.degrees(frames.tilt_rad), -1, 0), strict=True))
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays, unit="m", quantity="range")
-    return write_atomically(path, buffer.getvalue(), force=force)
+    return write_atomically(path, npz_bytes({**arrays, "unit": "m", "quantity": "range"}), force=force)
 
 
 def _read(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -89,6 +90,13 @@ def note_disorder(times: NDArray[np.float64], path: Path, place: Callable[[int],
     if counts:
         first = int(np.flatnonzero(steps <= 0)[0]) + 1
         warnings.warn(f"{path}: {counts}, the first in {place(first)}; the frames keep their order", stacklevel=2)
+
+
+def npz_bytes(arrays: Mapping[str, Any]) -> bytes:
+    """Return arrays as the content of an NPZ file."""
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)
+    return buffer.getvalue()
 
 
 @contextmanager

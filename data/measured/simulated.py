@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError, __version__
 from phasemark.data.files.atomic_write import replacing, write_atomically
 from phasemark.data.files.csv_cell import csv_text
+from phasemark.data.measured.recording import npz_bytes
 from phasemark.data.seeds import stream
 from phasemark.render import Background, Flag, Frames, Renderer, Sensor, Views, capture
 from phasemark.render.direct import HistogramRenderer
@@ -178,10 +178,8 @@ def write_recording(
         return write_atomically(path, _csv(recording, told).encode(), force=force)
     arrays, unit, quantity = _arrays(recording)
     if suffix == ".npz":
-        buffer = io.BytesIO()
-        stated: dict[str, Any] = {"unit": unit, "quantity": quantity, "simulated": told}
-        np.savez(buffer, **{**arrays, **stated})
-        return write_atomically(path, buffer.getvalue(), force=force)
+        content = npz_bytes({**arrays, "unit": unit, "quantity": quantity, "simulated": told})
+        return write_atomically(path, content, force=force)
     with replacing(path, force=force) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["simulated"] = told
         for name, values in arrays.items():
