@@ -35,16 +35,11 @@ def quantity_m(frames: FrameSet, sample: Sample, quantity: RangeOrZ) -> NDArray[
 
 def truth_columns(frames: FrameSet, sample: Sample) -> dict[str, NDArray[Any]]:
     """Return the truth of a block in the units of plans, with class, split and view; of scenes with their labels."""
-    columns: dict[str, NDArray[Any]]
+    split = np.array(frames.splits)[sample["split_index"]]
     if isinstance(frames, SceneFrameSet):
-        columns = {name: sample[name] for name in ("view", "sequence", "step")}
-        columns["split"] = np.array(frames.splits)[sample["split_index"]]
-        return columns | {name: sample[name] for name in frames.truth if name.startswith("label_")}
-    columns = {
-        "view": sample["view"],
-        "class": np.asarray(sample["class_name"], dtype=str),
-        "split": np.array(frames.splits)[sample["split_index"]],
-    }
+        labels = {name: sample[name] for name in frames.truth if name.startswith("label_")}
+        return {name: sample[name] for name in ("view", "sequence", "step")} | {"split": split} | labels
+    columns = {"view": sample["view"], "class": np.asarray(sample["class_name"], dtype=str), "split": split}
     for name in TRUTH_KEYS.values():
         if name not in TILT or getattr(frames.plan, name) is not None:
             values = np.asarray(sample[name.replace("_deg", "_rad")], float)  # a sample has angles in radians

@@ -79,8 +79,8 @@ class PlacedScene:
 
         def bodies(placed: PlacedScene) -> list[tuple[Any, ...]]:
             arrays = [(np.asarray(one.albedo).tobytes(), one.mesh.vertices.tobytes()) for one in placed.scene or ()]
-            lights = [(one.name, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()]
-            return [*lights, *arrays]
+            numbers = [(one.name, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()]
+            return [*numbers, *arrays]
 
         return (
             bodies(self) == bodies(other)

@@ -109,15 +109,9 @@ class Comparison:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers and lists, for JSON."""
-        columns: dict[str, NDArray[Any]] = {
-            "x": self.x,
-            "predicted": self.predicted,
-            "simulated": self.simulated,
-            "low95": self.simulated - self.half95,
-            "high95": self.simulated + self.half95,
-            "samples": self.samples,
-            "compared": self.compared,
-        }
+        columns: dict[str, NDArray[Any]] = {name: getattr(self, name) for name in ("x", "predicted", "simulated")}
+        columns |= {"low95": self.simulated - self.half95, "high95": self.simulated + self.half95}
+        columns |= {"samples": self.samples, "compared": self.compared}
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
         return {
             **{name: getattr(self, name) for name in ("figure", "label", "x_name", "y_name")},
