@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection
-from dataclasses import dataclass
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -276,7 +275,7 @@ class SceneFramesPlan(SensorPlan):
         InputFileError
             A listed file cannot be read.
         """
-        return SceneSource.of(self)
+        return SceneSource(self)
 
     def generate(self, index: int) -> GeneratedScene:
         """Return a scene as its generator makes it; it depends on seed and number alone.
@@ -298,46 +297,42 @@ class SceneFramesPlan(SensorPlan):
         return narrowed(split_of_views(self.seed, self.splits, 0, self.n_scenes), "|u1", "splits")
 
 
-@dataclass(frozen=True)
 class SceneSource:
-    """Maker of the scenes of a plan: a generator, or listed files.
+    """Maker of the scenes of a plan: its generator, which is imported, or its listed files, which are hashed.
 
     Parameters
     ----------
     plan : SceneFramesPlan
+
+    Attributes
+    ----------
     make : callable
         Returns the scene of a number, from a random generator.
     sha256 : str
         Of the generator's module, or of the files.
     """
 
-    plan: SceneFramesPlan
-    make: Callable[[int, np.random.Generator], GeneratedScene]
-    sha256: str
-
-    @classmethod
-    def of(cls, plan: SceneFramesPlan) -> Self:
-        """Import the generator of a plan, or hash its files."""
+    def __init__(self, plan: SceneFramesPlan) -> None:
         scenes = plan.scenes
         name = scenes.generator
         if name is None:
-            sha256 = sha256_of_files([each.path for each in scenes.list])
+            self.sha256 = sha256_of_files([each.path for each in scenes.list])
 
             def make(index: int, rng: np.random.Generator) -> GeneratedScene:
                 each = scenes.list[index]
                 return scene_of_file(each.path, each.up, [one.model_dump() for one in each.cameras], each.labels)
         else:
-            program, sha256 = imported_generator(name)
+            program, self.sha256 = imported_generator(name)
 
             def make(index: int, rng: np.random.Generator) -> GeneratedScene:
                 return generated(program, name, index, rng, scenes.options)
 
-        if scenes.source_sha256 not in (None, sha256):
+        if scenes.source_sha256 not in (None, self.sha256):
             what = "listed files are" if name is None else f"module of the generator '{name}' is"
             raise UsageError(
                 f"the {what} not as it was when the plan was resolved: give the old one, or build the set again"
             )
-        return cls(plan, make, sha256)
+        self.plan, self.make = plan, make
 
     def generate(self, index: int) -> GeneratedScene:
         """Return a scene; see :meth:`SceneFramesPlan.generate`."""
