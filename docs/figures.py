@@ -57,6 +57,9 @@ LEFT_BY = {
         "accuracy-bearing.png": "robustness/figures/rmse-bearing-deg.png",
         "accuracy-models.png": "robustness/figures/models.png",
     },
+    "phasemark sweep run multipath --out out/multipath": {
+        "accuracy-bounces.png": "multipath/figures/rmse-bounces.png",
+    },
     "phasemark landmark design --out out/design": {
         "design-bound.png": "design/bound.png",
         "design-pareto.png": "design/pareto.png",
@@ -66,6 +69,7 @@ LEFT_BY = {
 _SWEEP = ("matcher/sweep/figures", "render/charts.py")
 SOURCES = {
     "accuracy-bearing.png": ("matcher/sweep/plans/robustness.toml", *_SWEEP),
+    "accuracy-bounces.png": ("matcher/sweep/plans/multipath.toml", *_SWEEP),
     "accuracy-distance.png": ("matcher/sweep/plans/paper.toml", *_SWEEP),
     "accuracy-frames.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),
     "accuracy-map.png": ("matcher/sweep/plans/distance-angle-noise.toml", *_SWEEP),

@@ -18,6 +18,7 @@ from phasemark.data import Bank, build_bank
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.accuracy import accuracy_card, multipath_shift
 from phasemark.matcher.diagnosis.search import wider
+from phasemark.matcher.likelihood.systematic import carried_covariances, carried_errors
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture, preset
 from phasemark.render.bounces import standing
 
@@ -204,6 +205,19 @@ def test_light_that_bounces_unmodelled_is_in_the_covariance(
     held = np.abs(errors[:, 0]) < 2.5 * errors[:, 1]
     assert (held | ~accepted).all()
     assert np.abs(errors[accepted, 0]).min(initial=1.0) > 1e-3  # as far off as the covariance says
+
+
+def test_multipath_may_move_a_view_beside_where_it_should_by_a_share_of_the_way() -> None:
+    terms = carried_errors(preset("pmd-16x16").with_(lamp_half_angle_deg=30), ["multipath"])
+    # two parameters of standard deviation 1; the brightest floor moves the first by 20
+    fields = np.array([[[20.0, 0.0]]]) / np.sqrt(terms["multipath"].covariance[0, 0])
+    plain = carried_covariances(np.eye(2)[None], np.eye(2)[None], fields, terms)["multipath"][0]
+    np.testing.assert_allclose(plain, np.diag([20.0**2 + 2.0**2, 2.0**2]))
+    # the same in other, correlated parameters
+    mixed = np.array([[3e-4, 1e-4], [-2e-3, 5e-3]])
+    rows = np.linalg.inv(mixed).T[None]
+    found = carried_covariances((mixed @ mixed.T)[None], rows, fields, terms)["multipath"][0]
+    np.testing.assert_allclose(found, mixed @ plain @ mixed.T)
 
 
 def test_bounces_that_no_renderer_computes_are_refused(mesh: trimesh.Trimesh, sensor: Sensor) -> None:

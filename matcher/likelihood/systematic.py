@@ -52,8 +52,9 @@ SUPPOSED_ALBEDO = 0.5
 _LARGEST_ALBEDO = 0.6
 _LOWEST_M = 0.01
 _FLOOR_STEP_M, _WALL_STEP_M = 0.1, 0.1
-_ASKEW = 0.3
-"""How far off the direction is that multipath moves a view in, as a share of the way."""
+_ASKEW = 0.1
+"""How far a view that multipath moves ends beside where it should, as a share of the way, both in standard deviations
+of noise."""
 
 
 def check_systematic(names: Collection[str]) -> tuple[Systematic, ...]:
@@ -274,12 +275,17 @@ def carried_covariances(
         Whitened Jacobian √W K by :func:`fields_of` the terms, transposed.
     terms : mapping of str to Carried
     """
-    gain = covariance @ (rows @ rows_of_fields.transpose(0, 2, 1))
+    pull = rows @ rows_of_fields.transpose(0, 2, 1)
+    gain = covariance @ pull
     names = fields_of(terms)
     found: dict[Systematic, NDArray[np.float64]] = {}
     for term, one in terms.items():
-        own = gain[:, :, [names.index(name) for name in one.fields]]
+        columns = [names.index(name) for name in one.fields]
+        own = gain[:, :, columns]
         found[term] = np.asarray(own @ one.covariance @ own.transpose(0, 2, 1))
         if term == "multipath":
-            found[term] = found[term] + np.eye(own.shape[1]) * _ASKEW**2 * found[term]
+            way = np.einsum(
+                "npc,cd,npd->n", own, one.covariance, pull[:, :, columns]
+            )  # squared, in standard deviations
+            found[term] = found[term] + _ASKEW**2 * way[:, None, None] * covariance
     return found

@@ -65,8 +65,8 @@ class Condition:
     floor_m : float
         How far a floor lies below the lens, metres; 0: no floor.
     bounces : int
-        How often light bounces between landmark, wall and floor (PHYSICS section 12). Of a lamp that does not say how
-        wide it shines, only 0.
+        How often light bounces between landmark, wall and floor (PHYSICS section 12); unless 0, the sensor has to state
+        `lamp_half_angle_deg`.
     """
 
     class_name: str
