@@ -26,7 +26,7 @@ from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
 
 _PILOT = 0.5
 """Size of the first, coarse patches as a share of their distance from the lens."""
-_COARSEST, _LAST = 0.28, 0.06
+_COARSEST, _LAST = 0.28, 0.04
 """Sizes between which patches are refined."""
 _FINEST, _OF_PIXEL = 0.14, 0.4
 """Smallest size where surfaces meet: share of the size elsewhere, and of a pixel, whichever is larger."""

@@ -75,7 +75,7 @@ class SceneRenderer:
         harmonics: Sequence[int] | None = None,
         intersector: str = "auto",
         bounces: Bounces = 0,
-        bounce_tolerance: float = 1e-3,
+        bounce_tolerance: float = 3e-4,
     ) -> None:
         if not isinstance(scene, Scene):
             raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
