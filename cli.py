@@ -21,9 +21,9 @@ from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
 from phasemark.matcher.commands import (
     accuracy,
+    bank_trials,
     calibrate,
     characterise,
-    demo,
     design,
     drive,
     live,
@@ -31,9 +31,7 @@ from phasemark.matcher.commands import (
     match,
     plan,
     pose,
-    strangers,
     sweep,
-    verify,
     warm,
 )
 
@@ -120,7 +118,7 @@ def _add_commands(group: str, purpose: str, *functions: Callable[..., None]) -> 
 _add_commands(
     "", "",
     render.render_frame, match.match_frames, calibrate.calibrate_camera, locate.locate_rig, accuracy.accuracy_line,
-    demo.demo_report, drive.drive_robot, live.live_poses, warm.warm_kernels,
+    sweep.demo_report, drive.drive_robot, live.live_poses, warm.warm_kernels,
 )  # fmt: skip
 _add_commands(
     "landmark", "The landmarks: the catalogue and mesh files.",
@@ -134,7 +132,7 @@ _add_commands(
 )  # fmt: skip
 _add_commands(
     "bank", "Banks of model images.",
-    bank.bank_build, bank.bank_info, verify.bank_verify, strangers.bank_strangers, bank.bank_merge,
+    bank.bank_build, bank.bank_info, bank_trials.bank_verify, bank_trials.bank_strangers, bank.bank_merge,
 )  # fmt: skip
 _add_commands(
     "sweep", "Accuracy sweeps: errors of each method over conditions, with intervals.",

@@ -58,6 +58,5 @@ def accuracy_line(
     background = background_of(wall, floor, bounces)
     card = accuracy_card(renderer, views, others=others, n_frames=n_frames, background=background)
     if as_json:
-        echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})
-        return
+        return echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})
     echo(f"{name} {card.line()}")

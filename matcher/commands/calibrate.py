@@ -257,8 +257,7 @@ def _write_calibration(
     write_figure(figure, residual_figure(found), force, dpi=100)
     write_file(out, found.to_toml(base_name=readable(base_name)), force)
     if as_json:
-        echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
-        return
+        return echo_json({"file": str(out), "picture": str(figure), **found.as_dict()})
     _echo_calibration(found)
     echo(out, figure)
 

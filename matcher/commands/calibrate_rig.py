@@ -69,8 +69,7 @@ def calibrate_rig_file(
     for path, one, moved in zip(beside, names.values(), found.wall_m, strict=False):  # none if walls are not free
         files.append(write_file(path, one.with_walls_moved(moved[: len(one.walls)]).to_toml(), force))
     if as_json:
-        echo_json({"files": [str(path) for path in files], **found.as_dict()})
-        return
+        return echo_json({"files": [str(path) for path in files], **found.as_dict()})
     _echo(found)
     echo(*files)
 

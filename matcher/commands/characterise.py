@@ -49,8 +49,7 @@ def sensor_characterise(
         report = write_characterisation(found, readable(name_or_file), out, seed=seed, bound=bound, force=force)[0]
     if as_json:
         facts = found.as_dict()
-        echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
-        return
+        return echo_json({"report": str(report), "agreement": facts["agreement"], "quantities": facts["quantities"]})
     echo(*summary_sentences(found, name_or_file), *found.notes, report)
 
 

@@ -53,8 +53,7 @@ def landmark_design(
     )
 
     if example:
-        echo(example_design().removesuffix("\n"))
-        return
+        return echo(example_design().removesuffix("\n"))
     plan = default_design() if plan_file is None else read_design_plan(plan_file)
     if seed is not None:
         plan = plan.model_copy(update={"seed": seed})
@@ -69,8 +68,7 @@ def landmark_design(
             files = write_design(design, confirmed, out, force=force)
     facts = summary(design, confirmed)
     if as_json:
-        echo_json({"files": [str(path) for path in files], **facts})
-        return
+        return echo_json({"files": [str(path) for path in files], **facts})
     _echo_design(facts)
     echo(*files)
 

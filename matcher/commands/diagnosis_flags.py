@@ -13,6 +13,17 @@ if TYPE_CHECKING:
     from phasemark.matcher.diagnosis.diagnose import Change, Diagnosis
 
 
+_IN_FLAGS = {
+    "on": "{refine}--on {0}",
+    "quantity": "--quantity {0}",
+    "half_angle_deg": "a bank of a sensor file with half_angle_h_deg = {0[0]:.4g}, half_angle_v_deg = {0[1]:.4g}"
+    " (phasemark calibrate makes one)",
+    "bearing_offset_deg": "a bank of a sensor file with bearing_offset_deg = {0:.3g}, or the camera turned",
+    "distance_m": "phasemark bank build --distance with a grid that has {0:.2f} m",
+}
+"""Options that make a change, which depend on its value alone."""
+
+
 def diagnosis_text(diagnosis: Diagnosis, reading: FrameReading, nearest: bool, bearing_fixed: bool) -> str:
     """Return a diagnosis in one line that names options, given those of a command that it depends on."""
     return diagnosis.message(lambda change: _flags(change, reading, nearest, bearing_fixed))
@@ -31,8 +42,6 @@ def _flags(change: Change, reading: FrameReading, nearest: bool, bearing_fixed: 
         names = [name.removesuffix("_rad").removesuffix("_m") for name in value[2:]]
         instead = " instead of --fix bearing" if bearing_fixed and "bearing" in names else ""
         return refine + " ".join(f"--free {name}" for name in names) + instead
-    if change.parameter == "on":
-        return f"{refine}--on {value}"
     if change.parameter == "background":
         if isinstance(value, str):
             return f"{refine}--{value}-background"
@@ -45,20 +54,11 @@ def _flags(change: Change, reading: FrameReading, nearest: bool, bearing_fixed: 
     if change.parameter == "rotate":
         angle = (reading.rotate + value) % 360
         return f"--rotate {angle}" if angle else "without --rotate"
-    if change.parameter == "quantity":
-        return f"--quantity {value}"
     if change.parameter == "unit_factor":
         scale = None if reading.unit is None else METRES_PER_UNIT[reading.unit] * value
         right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)
         return f"a unit {value:g} times as large as the file states" if right is None else f"--unit {right}"
-    if change.parameter == "half_angle_deg":
-        return (
-            "a bank of a sensor file with"
-            f" half_angle_h_deg = {value[0]:.4g}, half_angle_v_deg = {value[1]:.4g} (phasemark calibrate makes one)"
-        )
-    if change.parameter == "bearing_offset_deg":
-        return f"a bank of a sensor file with bearing_offset_deg = {value:.3g}, or the camera turned"
-    return f"phasemark bank build --distance with a grid that has {value:.2f} m"
+    return _IN_FLAGS[change.parameter].format(value, refine=refine)
 
 
 def _flip(horizontal: bool, reading: FrameReading) -> str:

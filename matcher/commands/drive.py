@@ -45,8 +45,7 @@ def drive_robot(
     )
 
     if example:
-        echo(example_drive().removesuffix("\n"))
-        return
+        return echo(example_drive().removesuffix("\n"))
     plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
     note_plan_too_far(plan)
     with output_folder(out, "drive", OUTPUTS, force, plan):
@@ -56,8 +55,7 @@ def drive_robot(
             files = write_drive(drive, out, force=force)
     facts = drive.as_dict()
     if as_json:
-        echo_json({"files": [str(path) for path in files], **facts})
-        return
+        return echo_json({"files": [str(path) for path in files], **facts})
     _echo_drive(facts)
     echo(*files)
 

@@ -156,26 +156,9 @@ def _bank(name: Path, mesh: Landmark, sensor: str | None, distance: str) -> Bank
         return open_any_bank(name)
     if sensor is None:
         raise UsageError(f"--landmark {name} needs --sensor NAME, a preset (phasemark sensor list) or a file")
-    from phasemark.data import BankPlan
-    from phasemark.data.bank.bank_cache import cached_bank
-    from phasemark.data.plans.bank_plan import MeshPlan
-    from phasemark.landmarks import catalog
-
-    read_sensor(sensor)
-    is_class = str(name) in catalog()
+    read_sensor(sensor)  # what is wrong with the sensor is said before what is wrong with the mesh
     read_landmark(str(name), MeshReading(mesh.part_unit, mesh.up, mesh.origin))
-    own = MeshPlan(name=name.stem, path=str(name), unit=mesh.part_unit, up=mesh.up, origin=mesh.origin)
-    axis: Any = f"{distance}:0.02" if distance.count(":") == 1 else distance
-    plan = BankPlan(
-        sensor=sensor,
-        distance_m=axis,
-        classes=(str(name),) if is_class else (),
-        landmarks=(),
-        meshes=() if is_class else (own,),
-        layout="factored" if is_class else "full",
-    ).resolve()
-    with LongWork("building a bank") as progress:
-        return cached_bank(plan, keep=not mesh.no_cache, progress=progress)
+    return mesh.built(name, sensor, mesh.part_unit, f"{distance}:0.02" if distance.count(":") == 1 else distance)
 
 
 def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Tracker:

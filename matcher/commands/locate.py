@@ -19,7 +19,6 @@ from phasemark.data.commands.outputs import refuse_existing, refuse_other_files,
 if TYPE_CHECKING:
     from phasemark.matcher.locate.locator import LocatedPose, Locator
     from phasemark.matcher.locate.recording import RigRecording
-    from phasemark.matcher.locate.rig import Rig
 
 
 def locate_rig(
@@ -79,9 +78,11 @@ def locate_rig(
         A figure of the poses in their maps, .png.
     """
     from phasemark.matcher.locate.figures import locate_figure
+    from phasemark.matcher.locate.locator import Locator
     from phasemark.matcher.locate.pose_table import pose_csv
     from phasemark.matcher.locate.recording import read_rig_recording
     from phasemark.matcher.locate.rig import read_rig
+    from phasemark.matcher.locate.wall_map import read_wall_map
 
     refuse_other_files(out, ".csv", "the table")
     if plot is not None:
@@ -93,7 +94,8 @@ def locate_rig(
         for path in recordings:
             recording = read_rig_recording(path, rig)
             recording = recording if frames is None else recording.first_frames(frames)
-            locator = _locator(map_file, map_name, rig, recording, (tolerance, math.radians(tolerance_yaw)))
+            wall_map = read_wall_map(map_file, map_name or recording.map_name)
+            locator = Locator(wall_map, rig, tolerance_m=tolerance, tolerance_rad=math.radians(tolerance_yaw))
             found = _located(locator, recording, start, odometry, std, smooth)
             drawn.append((recording.run, locator.model.outline, found, None))
             answers += found
@@ -102,21 +104,9 @@ def locate_rig(
     if plot is not None:
         write_figure(plot, locate_figure(drawn), force)
     if as_json:
-        echo_json({"file": str(out), "poses": [one.as_dict() for one in answers]})
-        return
+        return echo_json({"file": str(out), "poses": [one.as_dict() for one in answers]})
     _echo_summary(answers)
     echo(out)
-
-
-def _locator(
-    map_file: Path, map_name: str | None, rig: Rig, recording: RigRecording, tolerance: tuple[float, float]
-) -> Locator:
-    """Return the locator of a recording's map."""
-    from phasemark.matcher.locate.locator import Locator
-    from phasemark.matcher.locate.wall_map import read_wall_map
-
-    wall_map = read_wall_map(map_file, map_name or recording.map_name)
-    return Locator(wall_map, rig, tolerance_m=tolerance[0], tolerance_rad=tolerance[1])
 
 
 def _located(

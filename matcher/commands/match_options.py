@@ -284,30 +284,34 @@ class Landmark:
         """Return a bank, or that of a mesh or a class over the distances that frames ask for: a kept or a new one."""
         if not self.is_for(name):
             return open_any_bank(name)
-        from phasemark.data import BankPlan
-        from phasemark.data.bank.bank_cache import cached_bank
-        from phasemark.data.plans.bank_plan import MeshPlan
         from phasemark.landmarks import catalog
         from phasemark.matcher.recordings.bank_for_frames import distances_of_frames
 
         camera_name = self.sensor or sensor_of_board(frames, reading.board)
         camera = read_sensor(camera_name)
         unit = self.part_unit or reading.unit
-        is_class = str(name) in catalog()
-        if is_class and (self.part_unit or self.up != "z" or self.origin != "file"):
+        if str(name) in catalog() and (self.part_unit or self.up != "z" or self.origin != "file"):
             raise UsageError(f"--part-unit, --up and --origin belong to a mesh: '{name}' is a class of the catalogue")
         _, mesh = read_landmark(str(name), MeshReading(unit, self.up, self.origin))
-        measured = reading.read(frames, camera)
+        return self.built(name, camera_name, unit, distances_of_frames(reading.read(frames, camera), mesh))
+
+    def built(self, name: Path, camera_name: str, unit: MeshUnitWord | None, distance_m: Any) -> Bank:
+        """Return the bank of a mesh or a class over some distances: a kept or a new one."""
+        from phasemark.data import BankPlan
+        from phasemark.data.bank.bank_cache import cached_bank
+        from phasemark.data.plans.bank_plan import MeshPlan
+        from phasemark.landmarks import catalog
+
+        is_class = str(name) in catalog()
+        mesh = MeshPlan(name=name.stem, path=str(name), unit=unit, up=self.up, origin=self.origin)
         plan = BankPlan(
             sensor=camera_name,
-            distance_m=distances_of_frames(measured, mesh),
+            distance_m=distance_m,
             classes=(str(name),) if is_class else (),
             landmarks=(),
-            meshes=() if is_class else (
-                MeshPlan(name=name.stem, path=str(name), unit=unit, up=self.up, origin=self.origin),
-            ),
+            meshes=() if is_class else (mesh,),
             layout="factored" if is_class else "full",
-        ).resolve()  # fmt: skip
+        ).resolve()
         with LongWork("building a bank") as progress:
             return cached_bank(plan, keep=not self.no_cache, progress=progress)
 

@@ -63,8 +63,7 @@ def pose_report(
         poses[counted] = views_as_poses(Views.broadcast(*found.view[rows[counted]].T))
     report = report_of(poses, views, symmetry=symmetry)
     if as_json:
-        echo_json({"estimates": str(measured), "truth": str(truth), **report.as_dict()})
-        return
+        return echo_json({"estimates": str(measured), "truth": str(truth), **report.as_dict()})
     lines = report.rows()
     table = Table(list(lines[0]))
     table.echo([list(line.values()) for line in lines])

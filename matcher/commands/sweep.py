@@ -1,4 +1,4 @@
-"""Commands of ``phasemark sweep``: how accurate, where, and says who."""
+"""Commands of ``phasemark sweep``: how accurate, where, and says who; ``phasemark demo`` is the paper's experiment."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
-from phasemark.data.commands.options import Force, Index, Json, Out, Workers, one_of
+from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers, one_of
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
 
 Folder = Annotated[Path, Shown(metavar="DIR", help="A sweep's folder.")]
@@ -85,8 +85,7 @@ def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
     trials = read_sweep(folder)[1]
     cells = trials.cells()
     if as_json:
-        echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
-        return
+        return echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
     echo(*summary(trials, cells), report)
 
 
@@ -135,8 +134,7 @@ def sweep_compare(
 
     found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))
     if as_json:
-        echo_json([one.as_dict() for one in found])
-        return
+        return echo_json([one.as_dict() for one in found])
     shown = [one for one in found if one.significant or all_]
     echo_table(
         ("class", "D (m)", "δ (°)", "noise", "frames", "method", "quantity", str(first), str(second), "p", ""),
@@ -150,3 +148,39 @@ def sweep_compare(
         ),
     )  # fmt: skip
     echo(f"{sum(one.significant for one in found)} of {len(found)} differences are significant")
+
+
+def demo_report(
+    *,
+    out: Out = Path("out/demo"),
+    seed: Seed = 2005,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Run the paper's experiment and write its report: four landmarks, 80 to 120 cm, 0 to 90°.
+
+    Parameters
+    ----------
+    out
+        Folder for trials, tables and the report.
+    """
+    from phasemark.matcher.sweep.answer import answer
+    from phasemark.matcher.sweep.plan import read_sweep_plan
+    from phasemark.matcher.sweep.report import VIEW_HEADER, view_rows, write_report
+    from phasemark.matcher.sweep.run import run_sweep
+
+    refuse_existing([out / "plan.json"], force)
+    plan = read_sweep_plan("demo").model_copy(update={"seed": seed})
+    with LongWork("matching") as progress:
+        trials = run_sweep(plan, out, workers=workers, force=force, progress=progress)
+    with LongWork("writing the report"):
+        report = write_report(out)
+    cells = trials.cells()
+    if as_json:
+        return echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
+    echo(answer(cells))
+    for m, method in enumerate(trials.methods):
+        echo(f"\n{method}: medians and worst over the classes")
+        echo_table(VIEW_HEADER, view_rows(trials, m))
+    echo(f"\n{report}")
