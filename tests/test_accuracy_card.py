@@ -10,8 +10,8 @@ from phasemark.cli import main
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import cramer_rao
 from phasemark.matcher.accuracy import accuracy_card
+from phasemark.matcher.accuracy.appearance import class_distances_squared
 from phasemark.matcher.accuracy.expected_accuracy import CALIBRATION, DECLARED, EDGES, FACES
-from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, Views, predicted_range_std, preset
 

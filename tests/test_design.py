@@ -42,9 +42,8 @@ from phasemark.matcher.design import (
     turn_distance,
     write_design,
 )
-from phasemark.matcher.design.position_bound import box_alone
+from phasemark.matcher.design.measures import box_alone, upper_appearance
 from phasemark.matcher.design.search import Search
-from phasemark.matcher.design.separation import upper_appearance
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
 from phasemark.matcher.statistics import ratio_interval, rms_interval
 from phasemark.render import Renderer, Views, capture, preset

@@ -15,9 +15,9 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.landmarks.spec import Box
 from phasemark.matcher import Matcher, PixelKalman, calibrate, diagnose, kalman_filter, phasor_mean
+from phasemark.matcher.accuracy.appearance import class_distances_squared
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.accuracy.grid_spacing import grid_loss
-from phasemark.matcher.accuracy.look_alikes import class_distances_squared
 from phasemark.matcher.design import DesignPlan, turn_distance
 from phasemark.matcher.filters.filtered_frames import PixelState, noise_free
 from phasemark.matcher.likelihood.images import VIEW

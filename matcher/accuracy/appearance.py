@@ -1,18 +1,27 @@
-"""Noise-free images as the matcher weighs them, and how well one landmark's image imitates another's."""
+"""Noise-free images as the matcher weighs them, and how well one landmark's image imitates another's.
+
+The best imitation by another class is sought over distance and side.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark.matcher.one_frequency import phases_of
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.render import Background, Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 
 _STEP_M = 1e-4
+_SHIFT_M = np.arange(-0.04, 0.041, 0.02)
+_TURN_RAD = np.radians(np.arange(0.0, 360.0, 10.0))
+_STEPS = 3
+_LONGEST_STEP = np.array([0.02, math.radians(8.0)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +101,103 @@ class Appearance:
         gradient = (weighted * residual[..., None, :]).sum(axis=-1)
         return cost, gradient, weighted @ np.swapaxes(other.slope, -1, -2)
 
-    def one(self, k: int) -> Appearance:
-        """Return one view, to be broadcast against others."""
-        part = slice(k, k + 1)
-        return Appearance(self.range_m[part], self.weight[part], self.slope[part], self.coverage[part], self.sensor)
+    def __getitem__(self, which: slice | NDArray[np.integer]) -> Appearance:
+        """Return some of the views; a single one is broadcast against others."""
+        return Appearance(self.range_m[which], self.weight[which], self.slope[which], self.coverage[which], self.sensor)
+
+
+def least_cost(
+    truth: Appearance,
+    place: NDArray[np.float64],
+    images: Callable[[NDArray[np.float64], Sequence[str]], Appearance],
+    limited: Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]],
+) -> NDArray[np.float64]:
+    """Return the least cost of imitations of true frames along Gauss–Newton steps over distance and side, (n,).
+
+    Parameters
+    ----------
+    truth : Appearance
+    place : (n, 2) float64
+        Distance and side of the first imitation of each.
+    images : callable (place, parameters)
+        Returns the imitations at some places, with slopes by these parameters.
+    limited : callable (place, step)
+        Returns where a step may lead.
+    """
+    least = np.full(len(place), np.inf)
+    for step in range(_STEPS + 1):
+        parameters = ("distance_m", "delta_rad") if step < _STEPS else ()
+        cost, gradient, information = truth.imitated_by(images(place, parameters))
+        least = np.minimum(least, cost)
+        if parameters:
+            place = limited(place, np.einsum("nij,nj->ni", np.linalg.pinv(information), gradient))
+    return least
+
+
+def class_distances_squared(
+    renderer: Renderer,
+    views: Views,
+    others: Mapping[str, Renderer],
+    *,
+    n_frames: int = 50,
+    background: Background | None = None,
+) -> NDArray[np.float64]:
+    """Return d² between noise-free frames and the best imitation by each other class (PHYSICS section 7).
+
+    The imitation is sought over distance and side, on a grid about the true distance and then by Gauss–Newton steps, at
+    the true bearing and height. A pixel that only one of the two returns counts with the matcher's penalty.
+
+    Parameters
+    ----------
+    renderer : Renderer
+        The true landmark and its camera.
+    views : Views
+        The true views, n of them.
+    others : mapping of str to Renderer
+        The other classes, before the same camera.
+    n_frames : int
+        Frames that are averaged.
+    background : Background, optional
+
+    Returns
+    -------
+    (n, k) float64
+        One column for each class of `others`, in their order.
+    """
+    renderer, others = phases_of(renderer), {name: phases_of(other) for name, other in others.items()}
+    truth = Appearance.of(renderer, views, (), None, n_frames, background=background)
+    own = np.array([truth[k : k + 1].imitated_by(truth[k : k + 1])[0][0] for k in range(len(views))])
+    columns = [_as_another(truth, views, other, n_frames, background) for other in others.values()]
+    found = np.stack(columns, axis=1) if columns else np.zeros((len(views), 0))
+    return np.asarray(np.maximum(found - own[:, None], 0.0))
+
+
+def _as_another(
+    truth: Appearance, views: Views, other: Renderer, n_frames: int, background: Background | None
+) -> NDArray[np.float64]:
+    """Return the least cost of each true frame as another landmark, (n,)."""
+    n = len(views)
+    starts = 2
+    place = np.empty((n, starts, 2))
+    for same in np.unique(np.stack([views.distance_m, views.bearing_rad, views.height_m]), axis=1).T:
+        distance, bearing, height = same
+        members = np.flatnonzero(
+            (views.distance_m == distance) & (views.bearing_rad == bearing) & (views.height_m == height)
+        )
+        shift, side = (grid.ravel() for grid in np.meshgrid(_SHIFT_M, _TURN_RAD, indexing="ij"))
+        grid = Views.broadcast(distance + shift, side, bearing, height)
+        images = Appearance.of(other, grid, (), None, n_frames, background=background)
+        for k in members:
+            best = np.argsort(truth[k : k + 1].imitated_by(images)[0])[:starts]
+            place[k] = np.stack([grid.distance_m[best], grid.delta_rad[best]], axis=1)
+    whose = np.repeat(np.arange(n), starts)
+
+    def seen_at(at: NDArray[np.float64], parameters: Sequence[str]) -> Appearance:
+        moved = Views.broadcast(at[:, 0], at[:, 1], views.bearing_rad[whose], views.height_m[whose])
+        return Appearance.of(other, moved, parameters, None, n_frames, background=background)
+
+    def limited(at: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        return at + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+
+    least = least_cost(truth[whose], place.reshape(-1, 2), seen_at, limited)
+    return np.asarray(least.reshape(n, starts).min(axis=1))

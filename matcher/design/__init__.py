@@ -7,6 +7,13 @@ from phasemark.inputs import on_use
 if TYPE_CHECKING:
     from phasemark.matcher.design.confirm import Confirmation, Trial, confirm, confirm_design
     from phasemark.matcher.design.figures import bound_figure, pareto_figure
+    from phasemark.matcher.design.measures import (
+        ClassDistances,
+        RangeBound,
+        choose_far_apart,
+        range_bound,
+        turn_distance,
+    )
     from phasemark.matcher.design.output import (
         landmarks_toml,
         mesh_stl,
@@ -25,11 +32,8 @@ if TYPE_CHECKING:
         example_design,
         read_design_plan,
     )
-    from phasemark.matcher.design.position_bound import RangeBound, range_bound
     from phasemark.matcher.design.rules import AllowedDimensions, Check
-    from phasemark.matcher.design.run import run_design
-    from phasemark.matcher.design.search import Candidate, Design, Scored
-    from phasemark.matcher.design.separation import ClassDistances, choose_far_apart, turn_distance
+    from phasemark.matcher.design.search import Candidate, Design, Scored, run_design
 else:
     __getattr__, __dir__ = on_use.imported_on_use(__name__)
 

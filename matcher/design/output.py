@@ -20,8 +20,8 @@ from phasemark.landmarks import LandmarkSpec, build_mesh, export_mesh
 from phasemark.landmarks.spec import Box
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability
 from phasemark.matcher.design.confirm import Confirmation
+from phasemark.matcher.design.measures import RangeBound
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.position_bound import RangeBound
 from phasemark.matcher.design.rules import Check
 from phasemark.matcher.design.search import Candidate, Design, Scored
 from phasemark.matcher.statistics import ratio_interval

@@ -187,12 +187,8 @@ class AllowedDimensions:
 
     def checks(self, spec: LandmarkSpec) -> list[Check]:
         """Check a landmark by the rules of geometry and light."""
-        upper = [] if spec.upper is None else self.upper_checks(spec.box, spec.upper)
+        upper = () if spec.upper is None else self.upper_checks(spec.box, spec.upper)
         return [*self._box(spec.box), *upper, *self._light()]
-
-    def upper_checks(self, box: Box, upper: Upper) -> list[Check]:
-        """Check an upper part on a box by its rules."""
-        return list(self._upper(box, upper))
 
     def _box(self, box: Box) -> Iterator[Check]:
         extents, limits = self.plan.limits.extents_m, self.plan.limits
@@ -206,7 +202,8 @@ class AllowedDimensions:
         yield Check("edges of the box resolvable, far end", edge, limits.least_box_edge_px, "px", False)
         yield from self._unambiguous(radius)
 
-    def _upper(self, box: Box, upper: Upper) -> Iterator[Check]:
+    def upper_checks(self, box: Box, upper: Upper) -> Iterator[Check]:
+        """Check an upper part on a box by its rules."""
         extents, limits = self.plan.limits.extents_m, self.plan.limits
         radius, height = upper_size(upper)
         pixel_w, pixel_h = self.far_pixel_m

@@ -9,25 +9,31 @@ from __future__ import annotations
 
 import itertools
 import math
+import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.landmarks import LandmarkSpec
+from phasemark import UsageError
+from phasemark.data.progress import Progress, counter
+from phasemark.landmarks import LandmarkSpec, catalog
 from phasemark.landmarks.spec import Box, Upper
 from phasemark.matcher.accuracy.appearance import Appearance
-from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.position_bound import RangeBound, box_alone, range_bound
-from phasemark.matcher.design.rules import AllowedDimensions, Check
-from phasemark.matcher.design.separation import (
+from phasemark.matcher.design.measures import (
     ClassDistances,
+    RangeBound,
+    box_alone,
     choose_far_apart,
+    range_bound,
     turn_distance,
     upper_appearance,
 )
-from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_uppers
+from phasemark.matcher.design.plan import DesignPlan
+from phasemark.matcher.design.rules import AllowedDimensions, Check, upper_size
+from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_boxes, sample_uppers
 from phasemark.render import Sensor
 
 _BOX_MOVES = (8, 4, 2, 1)
@@ -134,25 +140,13 @@ class Search:
         self.allowed.check_possible()
         self.lattice = Lattice(plan.search.step_mm)
         self.workers = workers
-        self._bounds: dict[Box, RangeBound] = {}
-        self._turns: dict[Box, float] = {}
+        self.bound = cache(lambda box: range_bound(box_alone(box, plan), self.sensor, plan, workers=workers))
+        """Return the bound of a box."""
+        self.turn = cache(lambda box: turn_distance(box, self.sensor, plan))
+        """Return how far a box is from itself a quarter-turn on."""
         self.uppers: list[Upper] = []
         self._seen: list[Appearance] = []
-        self._pixels = np.zeros(0, np.int64)
         self._distances: ClassDistances | None = None
-
-    def bound(self, box: Box) -> RangeBound:
-        """Return the bound of a box."""
-        if box not in self._bounds:
-            spec = box_alone(box, self.plan)
-            self._bounds[box] = range_bound(spec, self.sensor, self.plan, workers=self.workers)
-        return self._bounds[box]
-
-    def turn(self, box: Box) -> float:
-        """Return how far a box is from itself a quarter-turn on."""
-        if box not in self._turns:
-            self._turns[box] = turn_distance(box, self.sensor, self.plan)
-        return self._turns[box]
 
     def look_at_uppers(self, progress: Callable[[], None]) -> None:
         """Render the parts that may stand on a box, and compare them; those too dim or too small are dropped."""
@@ -163,7 +157,6 @@ class Search:
             if upper_pixels(seen) >= least:
                 self.uppers.append(upper)
                 self._seen.append(seen)
-        self._pixels = np.array([upper_pixels(seen) for seen in self._seen], np.int64)
         self._distances = ClassDistances.between(self._seen)
 
     def candidate(self, box: Box, *, refined: bool = False) -> Candidate:
@@ -330,9 +323,77 @@ class Design:
 
     def front(self) -> list[Candidate]:
         """Return the feasible candidates no other beats in both worst position bound and class distance."""
-        rows = sorted((c for c in self.candidates if c.feasible), key=lambda c: (c.bound.worst_m, -c.class_distance))
+        rows = sorted((c for c in self.candidates if c.feasible), key=_rank)
         front: list[Candidate] = []
         for candidate in rows:
             if not front or candidate.class_distance > front[-1].class_distance:
                 front.append(candidate)
         return front
+
+
+def run_design(plan: DesignPlan, *, workers: int | None = None, progress: Progress | None = None) -> Design:
+    """Search a set of landmarks for a camera and a working range; the same plan gives the same set.
+
+    Parameters
+    ----------
+    plan : DesignPlan
+        Plan of the design.
+    workers : int, optional
+        Threads that render; None: one for each processor.
+    progress : callable (done, total), optional
+        Called with the work done and the work in all.
+
+    Returns
+    -------
+    Design
+
+    Raises
+    ------
+    UsageError
+        The sensor does not suit, or no landmark can serve the range: the rule that fails, with its number.
+    InputFileError
+        The sensor file cannot be read.
+    """
+    search = Search(plan, workers or os.cpu_count() or 1)
+    usual_refinement = 600  # steps of the refinement that a progress bar reckons with
+    step = counter(progress, plan.search.boxes + plan.search.uppers + usual_refinement)
+    search.look_at_uppers(step)
+    found: list[Candidate] = []
+    for steps in sample_boxes(plan, search.allowed, search.lattice):
+        found.append(search.candidate(box_of(search.lattice, steps)))
+        step()
+    feasible = [candidate for candidate in found if candidate.feasible]
+    if not feasible:
+        raise UsageError(_what_fails(plan, found))
+    for symmetry in sorted({candidate.symmetry for candidate in feasible}):
+        best = min((c for c in feasible if c.symmetry == symmetry), key=_rank)
+        refined = search.refine_box(best, step)
+        if refined is not best:
+            found.append(refined)
+    chosen = min((candidate for candidate in found if candidate.feasible), key=_rank)
+    uppers = sorted(search.refine_uppers(chosen, step), key=upper_size, reverse=True)
+    specs = [
+        LandmarkSpec(name=f"mark-{k}", box=chosen.box, upper=upper, albedo=plan.albedo)
+        for k, upper in enumerate(uppers, 1)
+    ]
+    known = [LandmarkSpec(**{**spec.model_dump(), "albedo": plan.albedo}) for spec in catalog().values()]
+    return Design(plan, tuple(found), chosen, search.score(specs), search.score(known), search)
+
+
+def _rank(candidate: Candidate) -> tuple[float, float]:
+    return candidate.bound.worst_m, -candidate.class_distance
+
+
+def _what_fails(plan: DesignPlan, found: list[Candidate]) -> str:
+    """Name the rule that no candidate keeps, or the rules that the best one breaks."""
+    near, far = plan.distance_m
+    start = f"no landmark can serve {near:g} … {far:g} m"
+    if not found:
+        return f"{start}: 'search.boxes' gave none to try"
+    for checks in zip(*(candidate.checks for candidate in found), strict=True):
+        if not any(check.passes for check in checks):
+            best = min(checks, key=lambda check: check.value if check.at_most else -check.value)
+            return f"{start}: rule {best}, of {len(found)} boxes tried"
+    nearest = min(found, key=lambda candidate: sum(not check.passes for check in candidate.checks))
+    broken = "; ".join(str(check) for check in nearest.checks if not check.passes)
+    return f"{start}: no box of {len(found)} keeps every rule at once; one breaks only {broken}"

@@ -1,9 +1,9 @@
-"""Distances between landmarks' frames: noncentralities between classes, and between a box and itself turned.
+"""Measures of a set of landmarks: the bound of the position over a working range, and distances between frames.
 
-The noncentrality d is the whitened distance between two noise-free frames, over everything that could make one imitate
-the other (PHYSICS section 7): two classes are confused with probability Q(d/2), see
-:func:`~phasemark.matcher.accuracy.cramer_rao.confusion_probability`. Pixels where one returns and the other cannot, or
-must and does not, count with the matcher's own penalty.
+The bound is that of Cramér and Rao by lower pixels. The noncentrality d is the whitened distance between two noise-free
+frames, over everything that could make one imitate the other (PHYSICS section 7): two classes are confused with
+probability Q(d/2), see :func:`~phasemark.matcher.accuracy.cramer_rao.confusion_probability`. Pixels where one returns
+and the other cannot, or must and does not, count with the matcher's own penalty.
 """
 
 from __future__ import annotations
@@ -17,14 +17,118 @@ from numpy.typing import NDArray
 
 from phasemark.landmarks import LandmarkSpec, build_mesh
 from phasemark.landmarks.spec import Box, Upper
-from phasemark.matcher.accuracy.appearance import Appearance
+from phasemark.matcher.accuracy.appearance import Appearance, least_cost
+from phasemark.matcher.accuracy.cramer_rao import cramer_rao
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.position_bound import SEARCH_TOLERANCE_M, box_alone
 from phasemark.matcher.one_frequency import phases_of
 from phasemark.render import Renderer, Sensor, Views
 
+SEARCH_TOLERANCE_M = 1e-4
+"""Of a surface while many are compared: a hundredth of a pixel."""
 _TURN_BIAS_RAD = np.radians(np.arange(-30.0, 31.0, 6.0))
 _TURN_SHIFT_M = np.arange(-0.06, 0.061, 0.015)
+
+
+@dataclass(frozen=True, eq=False)
+class RangeBound:
+    """Cramér–Rao bound over distance and side (PHYSICS section 7).
+
+    Lower pixels, ranges, the sensor's noise, (D, δ) free, no background; infinite where a view is not observed.
+
+    Parameters
+    ----------
+    distance_m : (n,) float64
+        Distances, metres.
+    delta_rad : (k,) float64
+        Viewing angles, radians.
+    distance_std_m, delta_std_rad : (n, k) float64
+        Cramér–Rao bounds of distance and angle, metres and radians.
+    pixels : (n, k) int64
+        How many lower pixels count.
+    """
+
+    distance_m: NDArray[np.float64]
+    delta_rad: NDArray[np.float64]
+    distance_std_m: NDArray[np.float64]
+    delta_std_rad: NDArray[np.float64]
+    pixels: NDArray[np.int64]
+
+    @property
+    def position_std_m(self) -> NDArray[np.float64]:
+        """Of the lens in the plane, √(σ_D² + D² σ_δ²), the root of the trace of its covariance, (n, k)."""
+        return np.hypot(self.distance_std_m, self.distance_m[:, None] * self.delta_std_rad)
+
+    @property
+    def worst_m(self) -> float:
+        """Largest position bound of all views."""
+        return float(self.position_std_m.max())
+
+    @property
+    def median_m(self) -> float:
+        """Median position bound of all views."""
+        return float(np.median(self.position_std_m))
+
+    @property
+    def worst_view(self) -> tuple[float, float]:
+        """Distance and side of the largest position bound."""
+        i, j = np.unravel_index(int(self.position_std_m.argmax()), self.position_std_m.shape)
+        return float(self.distance_m[i]), float(self.delta_rad[j])
+
+    @property
+    def distance_information(self) -> NDArray[np.float64]:
+        """Information about D with δ unknown, at the worst side, m⁻², (n,)."""
+        return np.asarray(1 / self.distance_std_m.max(axis=1) ** 2)
+
+
+def range_bound(
+    spec: LandmarkSpec,
+    sensor: Sensor,
+    plan: DesignPlan,
+    *,
+    distance_m: NDArray[np.float64] | None = None,
+    delta_rad: NDArray[np.float64] | None = None,
+    tolerance_m: float = SEARCH_TOLERANCE_M,
+    workers: int = 1,
+) -> RangeBound:
+    """Return the bound of a landmark where a plan samples it, or where it is told.
+
+    Parameters
+    ----------
+    spec : LandmarkSpec
+        The landmark.
+    sensor : Sensor
+        The camera.
+    plan : DesignPlan
+        Plan of the design.
+    distance_m : (n,) float64, optional
+        Distances; those of the plan's sampling if left out.
+    delta_rad : (k,) float64, optional
+        Angles; those of the plan's sampling if left out.
+    tolerance_m : float
+        Of the tessellation.
+    workers : int
+        Threads.
+    """
+    distance = plan.sampled_distance_m if distance_m is None else distance_m
+    delta = plan.sampled_delta_rad(spec.symmetry) if delta_rad is None else delta_rad
+    shape = (len(distance), len(delta))
+    renderer = Renderer(build_mesh(spec, tolerance_m=tolerance_m), sensor, albedo=spec.albedo)
+    d, a = np.meshgrid(distance, delta, indexing="ij")
+    bound = cramer_rao(renderer, Views.broadcast(d, a), n_frames=plan.n_frames, pixels="lower", workers=workers)
+    std = np.sqrt(np.einsum("npp->np", bound.covariance))
+    std[~np.isfinite(std).all(axis=1)] = math.inf
+    return RangeBound(
+        distance,
+        delta,
+        std[:, 0].reshape(shape),
+        std[:, 1].reshape(shape),
+        bound.pixels.sum(axis=(1, 2)).reshape(shape),
+    )
+
+
+def box_alone(box: Box, plan: DesignPlan) -> LandmarkSpec:
+    """Return a landmark with nothing on its box, which is all that lower pixels see."""
+    return LandmarkSpec(name="box", box=box, albedo=plan.albedo)
 
 
 def upper_appearance(upper: Upper, sensor: Sensor, plan: DesignPlan) -> Appearance:
@@ -152,17 +256,15 @@ def turn_distance(box: Box, sensor: Sensor, plan: DesignPlan) -> float:
     for k, side in enumerate(sides):
         views = Views.broadcast(far + shift, side + math.pi / 2 + turn)
         others = Appearance.of(renderer, views, (), rows, plan.n_frames)
-        best = int(truth.one(k).imitated_by(others)[0].argmin())
+        best = int(truth[k : k + 1].imitated_by(others)[0].argmin())
         place[k] = views.distance_m[best], views.delta_rad[best]
     turned = sides + math.pi / 2
     bounds = [np.c_[np.full(turn_sides, far + _TURN_SHIFT_M[end]), turned + _TURN_BIAS_RAD[end]] for end in (0, -1)]
-    least = np.full(turn_sides, np.inf)
-    gauss_newton_steps = 4
-    for _ in range(gauss_newton_steps):
-        views = Views.broadcast(place[:, 0], place[:, 1])
-        other = Appearance.of(renderer, views, ("distance_m", "delta_rad"), rows, plan.n_frames)
-        cost, gradient, information = truth.imitated_by(other)
-        least = np.minimum(least, cost)
-        place = place + np.einsum("nij,nj->ni", np.linalg.pinv(information), gradient)
-        place = np.clip(place, *bounds)  # a step too long would end at the truth itself
-    return float(np.sqrt(least.min()))
+
+    def seen_at(at: NDArray[np.float64], parameters: Sequence[str]) -> Appearance:
+        return Appearance.of(renderer, Views.broadcast(at[:, 0], at[:, 1]), parameters, rows, plan.n_frames)
+
+    def limited(at: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(np.clip(at + step, *bounds))  # a step too long would end at the truth itself
+
+    return float(np.sqrt(least_cost(truth, place, seen_at, limited).min()))
