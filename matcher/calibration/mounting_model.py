@@ -30,6 +30,9 @@ from phasemark.render.sensor.lens_rates import lens_rates
 from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
+_Float = NDArray[np.float64]
+_Bool = NDArray[np.bool_]
+
 LONGEST_STEP = 1.0
 """No descent steps farther at once, in natural units: slopes jump where edges pass corners of pixels."""
 STEP = 2e-4
@@ -67,25 +70,25 @@ class Images:
     """
 
     phasor: NDArray[np.complex128]
-    intensity: NDArray[np.float64]
-    coverage: NDArray[np.float64]
+    intensity: _Float
+    coverage: _Float
     alone: NDArray[np.complex128]
 
 
-def range_residual(evidence: Evidence, images: Images) -> NDArray[np.float64]:
+def range_residual(evidence: Evidence, images: Images) -> _Float:
     """Return measured less modelled ranges, metres, (K, pixels); NaN where the model sees nothing."""
     late = np.angle(evidence.value * images.phasor.conj())
     return np.where(images.phasor != 0, evidence.sensor.metres_per_radian * late, np.nan)
 
 
-def natural_units(sensor: Sensor) -> NDArray[np.float64]:
+def natural_units(sensor: Sensor) -> _Float:
     """Return the natural units of all parameters, with those of the terms of a sensor's lens, (21,)."""
     rates = {} if sensor.lens is None else lens_rates(sensor.lens, sensor.rows, sensor.cols)
     own = {name: _TERM_UNIT / rate for name, rate in rates.items()}
     return np.array([own.get(name, one.scale) for name, one in PARAMETERS.items()])
 
 
-def stretch_of(sensor: Sensor, theta: NDArray[np.float64]) -> float:
+def stretch_of(sensor: Sensor, theta: _Float) -> float:
     """Return the least share of its area at the axis that a lens leaves to any part of an image; 0 if it is no lens.
 
     A lens that folds inside the image, or is out of range, is none. Where the share is 0 it is about to fold.
@@ -151,7 +154,7 @@ class CalibrationModel:
         workers: int = 1,
         rendered: Callable[[], None] = lambda: None,
         track: PoseTrack | None = None,
-        stamp_s: NDArray[np.float64] | None = None,
+        stamp_s: _Float | None = None,
         one: OneFrequency | None = None,
         chip: bool = False,
     ) -> None:
@@ -177,11 +180,11 @@ class CalibrationModel:
                 for wall in np.unique(poses.wall_m)
             ]
 
-    def mounting(self, theta: NDArray[np.float64]) -> Mounting:
+    def mounting(self, theta: _Float) -> Mounting:
         """Return the mounting that numbers in the order of :data:`ALL_NAMES` mean."""
         return Mounting.of_vector(theta, self.sensor)
 
-    def moved(self, theta: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def moved(self, theta: _Float, step: _Float) -> _Float:
         """Return where a step leads within what a camera can have.
 
         Where the terms of the lens would fold it inside the image, or make none, their step is halved until they make
@@ -209,17 +212,13 @@ class CalibrationModel:
         there[lens] = theta[lens]
         return there
 
-    def stepped(
-        self, theta: NDArray[np.float64], columns: NDArray[np.int64], step: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def stepped(self, theta: _Float, columns: NDArray[np.int64], step: _Float) -> _Float:
         """Return where a step of some parameters leads; see :meth:`moved`."""
         whole = np.zeros(len(theta))
         whole[columns] = step
         return self.moved(theta, whole)
 
-    def beside(
-        self, theta: NDArray[np.float64], column: int, half: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    def beside(self, theta: _Float, column: int, half: float) -> tuple[_Float, _Float, float]:
         """Return both ends of a difference by one number and how far they are apart: less where a step is cut."""
         step = half * np.eye(len(theta))[column]
         high, low = self.moved(theta, step), self.moved(theta, -step)
@@ -235,7 +234,7 @@ class CalibrationModel:
         """Distance of the landmark's farthest point from its origin."""
         return float(np.linalg.norm(self._renderer.topology.vertices, axis=1).max())
 
-    def check_behind(self, theta: NDArray[np.float64], slack_m: float) -> None:
+    def check_behind(self, theta: _Float, slack_m: float) -> None:
         """Refuse walls and floors that cut the landmark by more than a mounting may be off.
 
         Parameters
@@ -254,16 +253,14 @@ class CalibrationModel:
             if background is not None:
                 background.check_behind(self._renderer.topology.vertices, views[which])
 
-    def lens_within(self) -> NDArray[np.bool_]:
+    def lens_within(self) -> _Bool:
         """Return from which poses the lens would stand in the landmark's foot print, (K,)."""
         vertices = self._renderer.topology.vertices[:, :2]
         distance, delta = self.poses.distance_m[:, None], self.poses.delta_rad
         lens = -distance * np.column_stack([np.cos(delta), np.sin(delta)])
         return np.asarray(((lens > vertices.min(axis=0)) & (lens < vertices.max(axis=0))).all(axis=1))
 
-    def images(
-        self, theta: NDArray[np.float64], shift: NDArray[np.float64] | None = None, *, need_alone: bool = False
-    ) -> Images:
+    def images(self, theta: _Float, shift: _Float | None = None, *, need_alone: bool = False) -> Images:
         """Render all poses.
 
         Parameters
@@ -294,12 +291,12 @@ class CalibrationModel:
 
     def slopes(
         self,
-        theta: NDArray[np.float64],
+        theta: _Float,
         names: Sequence[str],
         on: ResidualKind,
         *,
-        shift: NDArray[np.float64] | None = None,
-        width: NDArray[np.float64] | None = None,
+        shift: _Float | None = None,
+        width: _Float | None = None,
     ) -> NDArray[np.complex128]:
         """Return how the images change, by central differences.
 
@@ -361,12 +358,12 @@ class CalibrationModel:
             found["albedo"] = image.alone / theta[ALL_NAMES.index("albedo")]
         return np.stack([found[name] for name in names], axis=1)
 
-    def coverage(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    def coverage(self, theta: _Float) -> _Float:
         """Return the share of each pixel that sees the landmark, (K, pixels)."""
         views = self._views(theta, None)
         return self._render(self.mounting(theta), views, alone=True).coverage.reshape(len(views), -1)
 
-    def alone(self, images: Images, *, from_edges: bool = False) -> NDArray[np.bool_]:
+    def alone(self, images: Images, *, from_edges: bool = False) -> _Bool:
         """Return which pixels see nothing but the landmark, (K, pixels), or also a pixel away from its edges."""
         full = images.coverage > _FULL
         if not from_edges:
@@ -386,14 +383,14 @@ class CalibrationModel:
         longer = image.sensor.axis_cosine() / self._axis_cosine - 1
         return np.asarray(turn * np.exp(1j * np.nan_to_num(image.range_m) * longer / scale))
 
-    def poses_at(self, theta: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def poses_at(self, theta: _Float) -> tuple[_Float, _Float]:
         """Return the view of each frame and its rates per second, (K, 6) each; the rates are 0 at rest."""
         if self._track is not None and self._stamp_s is not None:
             return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])
         still = np.column_stack([getattr(self.poses, name) for name in VIEW_FIELDS])
         return still, np.zeros_like(still)
 
-    def _views(self, theta: NDArray[np.float64], shift: NDArray[np.float64] | None) -> Views:
+    def _views(self, theta: _Float, shift: _Float | None) -> Views:
         seen = self.poses_at(theta)[0]
         if shift is not None:
             seen[:, : shift.shape[1]] += shift

@@ -13,6 +13,9 @@ from phasemark.matcher.calibration.mounting import PARAMETERS, named
 from phasemark.render.integral.rounding import error_text
 from phasemark.render.sensor.lens_fields import TERMS
 
+_Float = NDArray[np.float64]
+_Bool = NDArray[np.bool_]
+
 _WELL = 0.05
 """And below which what it trades with does not matter: 3 arc minutes, half a millimetre."""
 _TRADES = 0.95
@@ -49,9 +52,7 @@ def advice(names: Sequence[str], poses: KnownPoses) -> str:
     return f"{'; '.join(hints)}; or state what is known and give {fixed}"
 
 
-def observability_notes(
-    free: Sequence[str], covariance: NDArray[np.float64], scale: NDArray[np.float64], poses: KnownPoses
-) -> list[str]:
+def observability_notes(free: Sequence[str], covariance: _Float, scale: _Float, poses: KnownPoses) -> list[str]:
     """Note which numbers are poorly known, and which pairs are correlated.
 
     Parameters
@@ -109,7 +110,7 @@ def pose_std_note(estimated: PoseStd) -> str:
     )
 
 
-def misfit_notes(excess: float, p_value: float, poses: KnownPoses, chi2_share: NDArray[np.float64]) -> list[str]:
+def misfit_notes(excess: float, p_value: float, poses: KnownPoses, chi2_share: _Float) -> list[str]:
     """Say that the model does not fit, and name the poses that fit far worse than the others.
 
     Parameters
@@ -170,9 +171,7 @@ def untold_notes(untold: Sequence[str]) -> list[str]:
     ]
 
 
-def recording_notes(
-    use: NDArray[np.bool_], left_out: float, systematic: NDArray[np.float64], *, in_file: bool
-) -> list[str]:
+def recording_notes(use: _Bool, left_out: float, systematic: _Float, *, in_file: bool) -> list[str]:
     """Note how many pixels disagreed, and which errors noise does not explain.
 
     Parameters

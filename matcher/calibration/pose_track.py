@@ -8,7 +8,7 @@ joined by cubic Hermite splines.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,14 +41,11 @@ class PoseTrack:
         Number of poses left out because their stamp repeats or runs backwards.
     jitter_s : float
         How far stamps are at least uncertain, standard deviation: 0 where none repeats.
-    sign : (6,) float64
-        Factors of the splines.
     """
 
     pieces: tuple[tuple[float, float, interpolate.CubicHermiteSpline], ...]
     dropped: int
     jitter_s: float = 0.0
-    sign: NDArray[np.float64] = field(default_factory=lambda: np.ones(6))
 
     @classmethod
     def of(cls, poses: KnownPoses) -> PoseTrack:
@@ -81,10 +78,6 @@ class PoseTrack:
             )
         return cls(tuple(pieces), int((~first).sum()), stamp_jitter(poses.time_s))
 
-    def mirrored(self) -> PoseTrack:
-        """Return the track with the other sign of δ, bearing and roll."""
-        return replace(self, sign=self.sign * np.array([1.0, -1.0, -1.0, 1.0, 1.0, -1.0]))
-
     def known(self, start_s: NDArray[np.float64], end_s: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return True where a stretch of time lies between two gaps, (n,)."""
         inside = [(start_s >= start) & (end_s <= end) for start, end, _ in self.pieces]
@@ -114,7 +107,7 @@ class PoseTrack:
                 inside = np.clip(time_s[own], start, end)
                 value[own] = spline(inside)
                 rate[own] = np.where((inside == time_s[own])[:, None], spline(inside, 1), 0.0)
-        return self.sign * value, self.sign * rate
+        return value, rate
 
 
 def _smooth(

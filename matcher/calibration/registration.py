@@ -12,6 +12,8 @@ from phasemark.matcher.calibration.mounting_model import LONGEST_STEP, Calibrati
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.render.sensor.lens_fields import TERMS
 
+_Float = NDArray[np.float64]
+
 _PLACES = ("pitch", "roll", "height", "bearing")
 OUTLINE = (*_PLACES, *HALF_ANGLES, *TERMS)
 """What an outline tells."""
@@ -28,9 +30,7 @@ _NEARBY_M = 0.1
 """A return so much farther from the landmark than its own size is something else."""
 
 
-def register(
-    model: CalibrationModel, evidence: Evidence, theta: NDArray[np.float64], free: Sequence[str]
-) -> NDArray[np.float64]:
+def register(model: CalibrationModel, evidence: Evidence, theta: _Float, free: Sequence[str]) -> _Float:
     """Move a mounting to where the landmark's outlines agree with which pixels returned from near it.
 
     Gauss–Newton on coverage less return, over differences of a seventh of a pixel, from the best of several pitches
@@ -65,17 +65,17 @@ def register(
 
     outline_noise = 0.2  # of a pixel: how much of it the model says returns, against whether it did
 
-    def difference(at: NDArray[np.float64]) -> NDArray[np.float64]:
+    def difference(at: _Float) -> _Float:
         returns = np.minimum(model.coverage(at) / enough, 1.0)
         return np.asarray(np.where(known, target - returns, 0.0) / outline_noise).ravel()
 
-    def cost(at: NDArray[np.float64]) -> float:
+    def cost(at: _Float) -> float:
         away = (at - theta)[columns] / scale / prior
         return float((difference(at) ** 2).sum() + (away**2).sum())
 
     outline_width = 0.2  # half width of its differences, natural units: a seventh of a pixel
 
-    def slope(at: NDArray[np.float64], column: int) -> NDArray[np.float64]:
+    def slope(at: _Float, column: int) -> _Float:
         unit = model.scale[column]
         high, low, span = model.beside(at, column, unit * outline_width)
         return np.asarray((difference(low) - difference(high)) / (span / unit))

@@ -40,6 +40,9 @@ from phasemark.render import predicted_range_std
 from phasemark.render.sensor.sensor_file import rounded
 from phasemark.render.threads import mapped
 
+_Float = NDArray[np.float64]
+_Bool = NDArray[np.bool_]
+
 _CLEAR = 1.5
 """Phasors count where the noise of one frame is below its limit by this factor: nearer to the limit a frame's own noise
 decides whether its pixel is valid, and the brighter half would stand for all."""
@@ -194,12 +197,12 @@ class Place:
         Their sum of squares, with that of `u`.
     """
 
-    theta: NDArray[np.float64]
-    u: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    theta: _Float
+    u: _Float
+    shift: _Float
     images: Images
-    use: NDArray[np.bool_]
-    residual: NDArray[np.float64]
+    use: _Bool
+    residual: _Float
     cost: float
 
 
@@ -214,32 +217,30 @@ class _Linear:
         By errors of the poses of unit variance.
     """
 
-    def __init__(self, rows: NDArray[np.float64], own_rows: NDArray[np.float64]) -> None:
+    def __init__(self, rows: _Float, own_rows: _Float) -> None:
         self.rows, self.own_rows = rows, own_rows
         self.cross = rows @ own_rows.transpose(0, 2, 1)
         self.own = own_rows @ own_rows.transpose(0, 2, 1) + np.eye(own_rows.shape[1])
         eliminated = np.linalg.solve(self.own, self.cross.transpose(0, 2, 1))
         self.pose_information = rows @ rows.transpose(0, 2, 1) - self.cross @ eliminated
         """Of each pose on the mounting, (K, p, p)."""
-        self.information: NDArray[np.float64] = self.pose_information.sum(axis=0)
+        self.information: _Float = self.pose_information.sum(axis=0)
 
-    def gradients(
-        self, residual: NDArray[np.float64], u: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def gradients(self, residual: _Float, u: _Float) -> tuple[_Float, _Float]:
         """Return the gradients of each pose: by the mounting, (K, p), and by its own errors, (K, q)."""
         own = np.einsum("kqr,kr->kq", self.own_rows, residual) - u
         eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
 
-    def own_step(self, own_gradient: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def own_step(self, own_gradient: _Float, step: _Float) -> _Float:
         """Return by how much each pose's errors move with a step of the mounting, (K, q)."""
         return self._solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
 
-    def own_promise(self, own_gradient: NDArray[np.float64]) -> float:
+    def own_promise(self, own_gradient: _Float) -> float:
         """Return by how much the cost would fall if the errors of the poses alone changed."""
         return float((own_gradient * self._solved(own_gradient)).sum())
 
-    def _solved(self, own_gradient: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _solved(self, own_gradient: _Float) -> _Float:
         return np.asarray(np.linalg.solve(self.own, own_gradient[..., None])[..., 0])
 
 
@@ -265,7 +266,7 @@ class StillFit:
         model: CalibrationModel,
         evidence: Evidence,
         free: Sequence[str],
-        factor: NDArray[np.float64] | None = None,
+        factor: _Float | None = None,
         *,
         edges: bool,
         noise_measured: bool = True,
@@ -278,7 +279,7 @@ class StillFit:
         self.edges = edges
         self._steady = _steady(evidence) if evidence.on == "ranges" and noise_measured else None
 
-    def start(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
+    def start(self, theta: _Float) -> _Float:
         """Move a mounting to where outlines agree (see :func:`register`); set range offset and albedo by averages."""
         theta = register(self.model, self.evidence, theta, [name for name in OUTLINE if name in self.free]).copy()
         images = self.model.images(theta)
@@ -296,7 +297,7 @@ class StillFit:
                 theta[ALL_NAMES.index("albedo")] *= measured / modelled
         return theta
 
-    def pixels(self, images: Images, *, cautious: bool = False) -> NDArray[np.bool_]:
+    def pixels(self, images: Images, *, cautious: bool = False) -> _Bool:
         """Return which pixels count at a mounting, (K, pixels).
 
         Those that returned and that one frame can measure (PHYSICS section 7): on phasors by what the model says, for
@@ -314,9 +315,7 @@ class StillFit:
             use &= self.model.alone(images, from_edges=cautious)
         return np.asarray(use)
 
-    def solve(
-        self, theta: NDArray[np.float64], use: NDArray[np.bool_], shift: NDArray[np.float64] | None = None
-    ) -> Place:
+    def solve(self, theta: _Float, use: _Bool, shift: _Float | None = None) -> Place:
         """Run Levenberg–Marquardt with the pixels given, then with those of where it led.
 
         Parameters
@@ -348,7 +347,7 @@ class StillFit:
                 break
         return self._with_its_pixels(place)
 
-    def knowledge(self, place: Place) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def knowledge(self, place: Place) -> tuple[_Float, _Float]:
         """Return the information of a place, from slopes that no corner and no faint pixel distort, and its scatter.
 
         Returns
@@ -362,7 +361,7 @@ class StillFit:
         by_pose, _ = linear.gradients(self._pull(place), place.u)
         return linear.information, by_pose.T @ by_pose
 
-    def information(self, theta: NDArray[np.float64], use: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def information(self, theta: _Float, use: _Bool) -> _Float:
         """Return the information of some pixels in a mounting, (p, p), at little cost."""
         return self._linearise(self._at(theta, np.zeros((len(use), self.factor.shape[2])), use)).information
 
@@ -384,7 +383,7 @@ class StillFit:
         exact = place.residual + np.einsum("kir,ki->kr", own, place.shift)
         effects = RandomEffects.of_frames(rows * self.scale[:, None], errors, exact)
 
-        def cost(log: NDArray[np.float64]) -> float:
+        def cost(log: _Float) -> float:
             return effects.minus_two_log(np.exp(log)[[0, 0, 1, 2]])  # a lens moves along and across
 
         found = [
@@ -400,9 +399,7 @@ class StillFit:
         best = min(found, key=lambda one: float(one.fun))
         return PoseStd(*np.exp(best.x).tolist())
 
-    def held_out(
-        self, place: Place, before_m: NDArray[np.float64], after_m: NDArray[np.float64]
-    ) -> tuple[float, float]:
+    def held_out(self, place: Place, before_m: _Float, after_m: _Float) -> tuple[float, float]:
         """Return the r.m.s. residual of each pose with the mounting assumed, and with that of all other poses.
 
         The second by the jackknife of the linearised problem: without pose k the mounting moves by −(H − H_k)⁻¹ g_k.
@@ -425,7 +422,7 @@ class StillFit:
         use = self.pixels(place.images)
         return place if (use == place.use).all() else self._descend(self._at(place.theta, place.u, use))
 
-    def _residual(self, images: Images, use: NDArray[np.bool_]) -> NDArray[np.float64]:
+    def _residual(self, images: Images, use: _Bool) -> _Float:
         """Return whitened residuals, (K, pixels), on phasors (K, 2 · pixels)."""
         evidence = self.evidence
         root = np.sqrt(np.where(use, evidence.weight, 0.0))
@@ -436,13 +433,13 @@ class StillFit:
         difference = (evidence.value - images.phasor) * root
         return np.concatenate([difference.real, difference.imag], axis=1)
 
-    def _pull(self, place: Place) -> NDArray[np.float64]:
+    def _pull(self, place: Place) -> _Float:
         """Return the residuals that slopes can lower: what the model has left costs the same wherever it goes."""
         if self.evidence.on == "phasors":
             return place.residual
         return np.where(place.images.phasor == 0, 0.0, place.residual)
 
-    def _whitened(self, slope: NDArray[np.complex128], place: Place) -> NDArray[np.float64]:
+    def _whitened(self, slope: NDArray[np.complex128], place: Place) -> _Float:
         """Return whitened slopes, (K, parameters, residuals), of what the model's own say."""
         evidence = self.evidence
         root = np.sqrt(np.where(place.use, evidence.weight, 0.0))[:, None]
@@ -451,13 +448,13 @@ class StillFit:
             return np.asarray(evidence.sensor.metres_per_radian * slope.imag * seen)
         return np.concatenate([slope.real * root, slope.imag * root], axis=2)
 
-    def _at(self, theta: NDArray[np.float64], u: NDArray[np.float64], use: NDArray[np.bool_]) -> Place:
+    def _at(self, theta: _Float, u: _Float, use: _Bool) -> Place:
         shift = np.einsum("kij,kj->ki", self.factor, u)
         images = self.model.images(theta, shift)
         residual = self._residual(images, use)
         return Place(theta, u, shift, images, use, residual, float((residual**2).sum() + (u**2).sum()))
 
-    def _linearise(self, place: Place, *widths: NDArray[np.float64]) -> _Linear:
+    def _linearise(self, place: Place, *widths: _Float) -> _Linear:
         """Take slopes over the least widths, or those given; over several, the median of each pixel's."""
         names = (*self.free, *POSE[:3]) if self.factor.shape[2] else self.free
         found = [
@@ -512,9 +509,7 @@ class StillFit:
                 break
         return place
 
-    def _stepped(
-        self, place: Place, linear: _Linear, own_gradient: NDArray[np.float64], step: NDArray[np.float64]
-    ) -> Place:
+    def _stepped(self, place: Place, linear: _Linear, own_gradient: _Float, step: _Float) -> Place:
         theta = self.model.stepped(place.theta, self.columns, step)
         return self._at(theta, place.u + linear.own_step(own_gradient, step), place.use)
 
@@ -530,7 +525,7 @@ class StillFit:
         searched = 3  # directions, of those that the poses tell least, along which lower minima are looked for
         steps = (_SEARCH_STD[:, None, None] * ways[:, -searched:].T).reshape(-1, len(self.columns))
 
-        def stepped(step: NDArray[np.float64]) -> Place:
+        def stepped(step: _Float) -> Place:
             return self._stepped(place, wide, own_gradient, step)
 
         costs = mapped(lambda step: stepped(step).cost, list(steps), self.model.workers)
@@ -541,7 +536,7 @@ class StillFit:
         return self._descend(min(descended, key=lambda one: one.cost))
 
 
-def _steady(evidence: Evidence) -> NDArray[np.bool_]:
+def _steady(evidence: Evidence) -> _Bool:
     """Return which pixels were measured well enough for their ranges to count, (K, pixels)."""
     std, limit = evidence.one_frame_std_m, one_frame_limit_m(evidence.sensor)
     usual = np.array([np.median(one[known]) if (known := np.isfinite(one)).any() else 0.0 for one in std])

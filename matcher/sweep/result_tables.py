@@ -145,40 +145,30 @@ class SweepTrials:
 
     def trial_table(self, rows: slice) -> dict[str, list[Any]]:
         """Return the columns of trials.csv for some trials, trial by trial and method by method."""
-        m, names_of_view = len(self.methods), self.numbers
-        number = self.condition[rows]
-        error = self.error_of(rows)
-        shared: dict[str, Sequence[Any]] = {
-            "condition": number.tolist(),
-            "trial": self.trial[rows].tolist(),
-            "method": self.methods * len(number),
-            "class": [self.conditions[k].class_name for k in number],
-            **{f"true_{name}": self.truth[rows, i].tolist() for i, name in enumerate(names_of_view)},
-        }
-        names = (*self.classes, "none")
-        own: dict[str, NDArray[Any]] = {
-            **{name: self.estimate[rows, :, i] for i, name in enumerate(names_of_view)},
-            **{f"error_{name}": error[:, :, i] for i, name in enumerate(names_of_view)},
+        names, number, error = self.numbers, self.condition[rows], self.error_of(rows)
+        table: dict[str, NDArray[Any]] = {
+            "condition": number[:, None],
+            "trial": self.trial[rows, None],
+            "method": np.array(self.methods, object),
+            "class": np.array([self.conditions[k].class_name for k in number], object)[:, None],
+            **{f"true_{name}": self.truth[rows, None, i] for i, name in enumerate(names)},
+            **{name: self.estimate[rows, :, i] for i, name in enumerate(names)},
+            **{f"error_{name}": error[:, :, i] for i, name in enumerate(names)},
             "error_position_m": self.position_error_of(rows),
-            **{f"bound_{name}": np.sqrt(self.bound[rows, :, i, i]) for i, name in enumerate(names_of_view)},
+            **{f"bound_{name}": np.sqrt(self.bound[rows, :, i, i]) for i, name in enumerate(names)},
             **{
                 f"cov_{_SHORT[i]}_{_SHORT[j]}": self.covariance[rows, :, i, j]
-                for i in range(len(names_of_view))
-                for j in range(i, len(names_of_view))
+                for i in range(len(names))
+                for j in range(i, len(names))
             },
             **{name: getattr(self, name)[rows] for name in ("chi2", "dof", "p_value", "p_none")},
-            "found": np.array(names, object)[self.found[rows]],
+            "found": np.array([*self.classes, "none"], object)[self.found[rows]],
             "modes": self.modes[rows],
             "accepted": self.accepted[rows].astype(np.int64),
             "seconds": self.seconds[rows],
         }
-        return {
-            **{
-                name: list(values) if name == "method" else [value for value in values for _ in range(m)]
-                for name, values in shared.items()
-            },
-            **{name: values.reshape(-1).tolist() for name, values in own.items()},
-        }
+        shape = (len(number), len(self.methods))
+        return {name: np.broadcast_to(values, shape).ravel().tolist() for name, values in table.items()}
 
     def cells(self) -> tuple[Cell, ...]:
         """Judge every method under every condition."""

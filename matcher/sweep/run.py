@@ -117,10 +117,10 @@ def read_plan_of(folder: str | os.PathLike[str]) -> SweepPlan:
     InputFileError
         There is no sweep.
     """
-    plan = _stored_plan(Path(folder))
-    if plan is None:
+    path = Path(folder) / _PLAN
+    if not os.path.lexists(path):
         raise InputFileError(f"{folder}: holds no sweep: 'phasemark sweep run' makes one")
-    return plan
+    return stored_plan(path)
 
 
 def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
@@ -168,13 +168,6 @@ def _round_path(folder: Path, number: int) -> Path:
     return folder / f"trials-{number:03d}.h5"
 
 
-def _stored_plan(folder: Path) -> SweepPlan | None:
-    path = folder / _PLAN
-    if not os.path.lexists(path):
-        return None
-    return stored_plan(path)
-
-
 def sweep_folder(folder: Path) -> AbstractContextManager[OwnedFiles]:
     """Lock a sweep's folder against other runs, and list the files in it that belong to the sweep.
 
@@ -191,8 +184,9 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
     folder = ours.folder
     if force:
         ours.clear()
-    old = _stored_plan(folder) if _PLAN in ours.names else None
-    if old is not None:
+    begun = _PLAN in ours.names and os.path.lexists(folder / _PLAN)
+    if begun:
+        old = read_plan_of(folder)
         if not resume:
             raise OutputExistsError(f"{folder}: holds a sweep: resume=True goes on with it, force=True starts over")
         changes = difference(old.model_dump(mode="json"), plan.model_dump(mode="json"))
@@ -201,7 +195,7 @@ def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> N
                 f"{folder}: was begun with another plan ({'; '.join(changes[:4])}): force=True starts over"
             )
     ours.claim(*(path.name for path in sweep_outputs(folder)))
-    if old is None:
+    if not begun:
         write_atomically(folder / _PLAN, json_text(plan, indent=1).encode(), force=True)
 
 
