@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +20,9 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.render import Background, Renderer, Sensor, Views, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_rad
+
+_Float = NDArray[np.float64]
+_Rows = tuple[int, int] | None
 
 SIZES = (0.8, 0.85, 0.9, 0.95, 1.05, 1.1, 1.15, 1.2)
 """Fields of view that are tried, as ratios of the tangents of half angles."""
@@ -114,24 +117,13 @@ class Search:
         coarse = seen.with_slack(_SLACKS_M[0])
         free = [0, 1] + ([2] if bearing else []) + ([3] if len(sizes) > 1 else [])
         rows = self._sensor.lower_rows if self._shared else None
-        starts: list[tuple[float, int, NDArray[np.float64]]] = []
-        kept = 16
-        most_classes = 6
-        for c in range(1 if self._shared else min(len(self._names), most_classes)):
-            views = self._grid(c, frame, sizes, bearing, mixed=background is not None)
-            cost = self._costs(c, views, coarse, background, rows)
-            starts += [(float(cost[k]), c, views[k]) for k in np.argsort(cost, kind="stable")[:kept]]
-        starts.sort(key=lambda start: start[0])
-        starts = starts[: kept // 2]
-        if self._shared:
-            starts = [(0.0, c, view) for _, _, view in starts for c in range(len(self._names))]
-        whole: list[tuple[float, int, NDArray[np.float64]]] = []
-        for c in sorted({c for _, c, _ in starts}):
-            views = np.stack([view for _, k, view in starts if k == c])
-            cost = self._costs(c, views, coarse, background)
-            whole += [(float(cost[k]), c, views[k]) for k in range(len(views))]
-        whole.sort(key=lambda start: start[0])
-        whole = [start for start in whole if math.isfinite(start[0])]
+        kept, most_classes = 8, 6
+        classes = range(1 if self._shared else min(len(self._names), most_classes))
+        grids = {c: self._grid(c, frame, sizes, bearing, mixed=background is not None) for c in classes}
+        starts = self._ranked(grids, coarse, background, rows)[:kept]
+        of_class = {c: [view for _, k, view in starts if k == c or self._shared] for c in range(len(self._names))}
+        views = {c: np.stack(own) for c, own in of_class.items() if own}
+        whole = [start for start in self._ranked(views, coarse, background) if math.isfinite(start[0])]
         for slack_m, n in zip((*_SLACKS_M, 0.0), _REFINED, strict=True):
             if slack_m > seen.usual_std_m or slack_m == 0.0:
                 softened = seen.with_slack(slack_m)
@@ -144,9 +136,16 @@ class Search:
         delta_rad = float(wrap_delta_rad(delta_rad, delta_period_rad(self._symmetry[c])))
         return Fit(self._names[c], distance_m, delta_rad, bearing_rad, size, least, int(seen.returned.sum()))
 
-    def _grid(
-        self, c: int, frame: FilteredFrames, sizes: Sequence[float], bearing: bool, *, mixed: bool
-    ) -> NDArray[np.float64]:
+    def _ranked(
+        self, views: Mapping[int, _Float], seen: _Seen, background: Background | None, rows: _Rows = None
+    ) -> list[tuple[float, int, _Float]]:
+        """Return (cost, class, view) of the views of some classes, lowest cost first."""
+        found: list[tuple[float, int, _Float]] = []
+        for c, own in views.items():
+            found += zip(self._costs(c, own, seen, background, rows).tolist(), itertools.repeat(c), own)
+        return sorted(found, key=lambda start: start[0])
+
+    def _grid(self, c: int, frame: FilteredFrames, sizes: Sequence[float], bearing: bool, *, mixed: bool) -> _Float:
         """Return views (D, δ, bearing, size) about the nearest returns, (k, 4)."""
         sensor = self._sensor
         returned = frame.state[0] == PixelState.RETURN
@@ -171,26 +170,14 @@ class Search:
             grid += [(first + off, delta, b, size) for off, size, b in itertools.product(offsets, sizes, bearings)]
         return np.array(grid)
 
-    def _costs(
-        self,
-        c: int,
-        views: NDArray[np.float64],
-        seen: _Seen,
-        background: Background | None,
-        rows: tuple[int, int] | None = None,
-    ) -> NDArray[np.float64]:
+    def _costs(self, c: int, views: _Float, seen: _Seen, background: Background | None, rows: _Rows = None) -> _Float:
         """Return the cost of every view, infinite where it cannot be rendered."""
         residual, mismatch = self._residuals(c, views, seen, background, rows)
         return np.asarray(np.minimum(residual**2, MOST_COST).sum(axis=1) + MOST_COST * mismatch.sum(axis=1))
 
     def _residuals(
-        self,
-        c: int,
-        views: NDArray[np.float64],
-        seen: _Seen,
-        background: Background | None,
-        rows: tuple[int, int] | None = None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        self, c: int, views: _Float, seen: _Seen, background: Background | None, rows: _Rows = None
+    ) -> tuple[_Float, NDArray[np.bool_]]:
         """Return normalised residuals, 0 where frame and view cannot be compared, and which pixels contradict it."""
         first, stop = rows or (0, self._sensor.rows)
         picked = slice(first * self._sensor.cols, stop * self._sensor.cols)
@@ -225,8 +212,8 @@ class Search:
         return residual, mismatch
 
     def _refine(
-        self, c: int, view: NDArray[np.float64], free: list[int], seen: _Seen, background: Background | None
-    ) -> tuple[NDArray[np.float64], float]:
+        self, c: int, view: _Float, free: list[int], seen: _Seen, background: Background | None
+    ) -> tuple[_Float, float]:
         """Lower the cost by damped least squares (Levenberg–Marquardt)."""
         damping = 1e-2
         cost = math.inf
@@ -268,8 +255,8 @@ _LONGEST = (np.array([-0.05, -0.15, -0.05, -0.05]), np.array([0.05, 0.15, 0.05, 
 class _Seen:
     """Values of one frame at its pixels; (pixels,) arrays."""
 
-    range_m: NDArray[np.float64]
-    root_weight: NDArray[np.float64]
+    range_m: _Float
+    root_weight: _Float
     returned: NDArray[np.bool_]
     absent: NDArray[np.bool_]
 
