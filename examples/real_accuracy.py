@@ -36,7 +36,7 @@ from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template
-from phasemark.matcher.accuracy.pose_score import PoseScore
+from phasemark.matcher.accuracy.pose_errors import PoseScore
 from phasemark.render import Sensor
 from phasemark.render.charts import explain, legend_above, panels, style
 

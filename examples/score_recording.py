@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.accuracy.pose_score import PoseScore
+from phasemark.matcher.accuracy.pose_errors import PoseScore
 
 THICKNESS_M, FACING_DEG, GROSS = 0.01, 45.0, (30.0, 6.0)
 Floats = NDArray[np.float64]

@@ -26,8 +26,7 @@ from phasemark.matcher.drive import (
     run_drive,
     stops_csv,
 )
-from phasemark.matcher.drive.follow import Path, pan_towards
-from phasemark.matcher.drive.odometry import World
+from phasemark.matcher.drive.follow import Path, World, pan_towards
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.position import Placement

@@ -19,7 +19,7 @@ import trimesh
 from scipy import stats
 
 from phasemark.cli import main
-from phasemark.matcher.accuracy.pose_score import PoseScore
+from phasemark.matcher.accuracy.pose_errors import PoseScore
 
 pytestmark = pytest.mark.docs
 

@@ -112,7 +112,8 @@ class AccuracyCard:
         blind = int(np.isnan(self.position_std_m).sum())
         unseen = f", {blind} of {n} views not observed" if blind else ""
         error = _median(self.class_error)
-        classes = "" if math.isnan(error) else f"; class error {_percent(error)}"
+        percent = "below 0.01 %" if error < 1e-4 else f"{_written(100 * error)} %"
+        classes = "" if math.isnan(error) else f"; class error {percent}"
         return (
             f"{self._where()}: {numbers} ({over}{unseen}){classes};"
             f" {self.dominant} dominates ({100 * shares[self.dominant or '']:.0f} % of the position's variance)"
@@ -254,7 +255,3 @@ def _median(values: NDArray[np.float64]) -> float:
 def _written(value: float) -> str:
     """Write a number with two digits that count."""
     return f"{float(f'{value:.2g}'):g}"
-
-
-def _percent(share: float) -> str:
-    return "below 0.01 %" if share < 1e-4 else f"{_written(100 * share)} %"

@@ -104,11 +104,11 @@ def sweep_frames(folder: Folder, condition: Index, trial: Index, *, out: Out, fo
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.data.measured.reading import write_measured
-    from phasemark.matcher.sweep import examples
+    from phasemark.matcher.sweep import run
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     refuse_existing([out], force)
-    echo(write_measured(examples.sweep_frames(folder, condition, trial), out, force=force))
+    echo(write_measured(run.sweep_frames(folder, condition, trial), out, force=force))
 
 
 def sweep_compare(

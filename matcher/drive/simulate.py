@@ -16,8 +16,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.seeds import stream
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.matcher.accuracy.cramer_rao import cramer_rao
-from phasemark.matcher.drive.follow import Path, pan_towards
-from phasemark.matcher.drive.odometry import World
+from phasemark.matcher.drive.follow import Path, World, pan_towards
 from phasemark.matcher.drive.plan import DrivePlan
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match

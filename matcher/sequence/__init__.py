@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING
 from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
-    from phasemark.matcher.sequence.free_motion import FreeMotion
-    from phasemark.matcher.sequence.odometry import OdometryPlan, Reading
+    from phasemark.matcher.sequence.odometry import FreeMotion, OdometryPlan, Reading
     from phasemark.matcher.sequence.pose_estimator import Estimate, PoseEstimator
     from phasemark.matcher.sequence.pose_filter import Motion, PoseFilter, Sighting
     from phasemark.matcher.sequence.standing import Standing

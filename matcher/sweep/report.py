@@ -18,9 +18,10 @@ from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_figure
+from phasemark.matcher.figures import match_figure
+from phasemark.matcher.match import Match
 from phasemark.matcher.statistics import Interval
 from phasemark.matcher.sweep.answer import answer, answer_cells, card_of, said
-from phasemark.matcher.sweep.examples import example_trials
 from phasemark.matcher.sweep.figures.sheet import SweepFigure, sweep_figures
 from phasemark.matcher.sweep.figures.style import AXIS_LABEL
 from phasemark.matcher.sweep.job import Round, SweepJob
@@ -96,7 +97,7 @@ def _page(
         gallery=_gallery(job),
         range_colours=RANGE_COLOURS,
         figures=shown,
-        examples=example_trials(job, trials, max(1, _MOST_EXAMPLES // len(trials.methods)), folder),
+        examples=_example_trials(job, trials, max(1, _MOST_EXAMPLES // len(trials.methods)), folder),
         header=(
             *(AXIS_LABEL[name] for name in axes), "method", "trials", "share of outliers", "RMSE of D (mm)",
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
@@ -271,4 +272,54 @@ def _facts(plan: SweepPlan, trials: SweepTrials) -> dict[str, Any]:
         "time": f"{', '.join(times)}: matching, added up over the threads",
         "seed": str(plan.seed),
         "versions": ", ".join(f"{name} {version}" for name, version in versions().items()),
+    }
+
+
+def _example_trials(job: SweepJob, trials: SweepTrials, n: int, folder: Path) -> Iterator[dict[str, Any]]:
+    """Yield entries of a page for each method: a trial of median error over its bound, and its n worst conditions."""
+    error = trials.error
+    sigma = 1e-9  # errors in units of a bound that is unknown come before all others
+    for m in range(len(trials.methods)):
+        with np.errstate(invalid="ignore"):
+            std = np.sqrt(np.einsum("npp->np", trials.bound[:, m]))[:, :2]
+            scaled = np.abs(error[:, m, :2]) / np.where(std > sigma, std, sigma)
+        badness = np.where(np.isfinite(scaled).all(axis=1), scaled.max(axis=1), np.inf)
+        ranked = [int(k) for k in np.argsort(-badness, kind="stable") if trials.true_class[k] >= 0]
+        if ranked:
+            yield _example(job, trials, m, ranked[len(ranked) // 2], "typical", folder)
+        worst: dict[int, int] = {}
+        for k in ranked:
+            worst.setdefault(int(trials.condition[k]), k)
+        for k in list(worst.values())[:n]:
+            yield _example(job, trials, m, k, "among the worst", folder)
+
+
+def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, rank: str, folder: Path) -> dict[str, Any]:
+    number, trial, method = int(trials.condition[k]), int(trials.trial[k]), trials.methods[m]
+    image = job.image(number, job.views(number, trial, trial + 1))
+    frames = job.frames(number, job.plan.methods[m], image, trial)
+    found, covariance = int(trials.found[k, m]), trials.covariance[k, m]
+    truth, error, p_value = trials.truth[k], trials.error[k, m], trials.p_value[k, m]
+    shown = trials.conditions[number].class_name
+    text = f"{shown} at D = {truth[0]:.4f} m, δ = {math.degrees(truth[1]):.2f}°; {method} found "
+    view: dict[str, Any] = {"class_name": None}
+    if found < 0:
+        text += "no landmark"
+    else:
+        view = dict(zip(trials.numbers, trials.estimate[k, m].tolist(), strict=True))
+        view |= {"class_name": trials.classes[found], "symmetry": trials.symmetry[found]}
+        errors = f"{1e3 * error[0]:+.2f} mm and {math.degrees(error[1]):+.2f}°".replace("-", "−")
+        text += f"{trials.classes[found]}, error {errors}"
+        text += f", p = {p_value:.2g}" if math.isfinite(p_value) else ""
+    match = Match(
+        accepted=bool(trials.accepted[k, m]),
+        covariance=covariance if np.isfinite(covariance[:2, :2]).all() else None,
+        **view,
+    )
+    figure = match_figure(frames, match, job.bank(m), job.background(number), title=False)
+    return {
+        "title": f"{method}, {rank}: condition {number}, trial {trial}",
+        "text": text,
+        "image": embedded_png(figure_png(figure), text),
+        "command": f"phasemark sweep frames {shlex.quote(str(folder))} {number} {trial} -o frames.npz",
     }

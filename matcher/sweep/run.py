@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, OutputExistsError
+from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.folder_marker import OwnedFiles, adding_to_folder
 from phasemark.data.files.hdf5_reading import check_format, open_hdf5, reading
@@ -27,6 +27,7 @@ from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, STORED, Round, S
 from phasemark.matcher.sweep.own_matcher import imported_matcher
 from phasemark.matcher.sweep.plan import SweepPlan, stored_plan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
+from phasemark.render import Frames
 
 TRIALS_AT_ONCE = 50
 """Trials of a shard: of one batch of a method, whatever the number of workers, so that no rounding depends on it."""
@@ -149,6 +150,39 @@ def read_sweep(folder: str | os.PathLike[str]) -> tuple[SweepPlan, SweepTrials]:
     if n == 0:
         raise InputFileError(f"{folder}: its sweep is not finished: run_sweep(resume=True) goes on")
     return plan, _read(plan, folder, n)
+
+
+def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> Frames:
+    """Take the frames of one trial of a sweep again, bit for bit.
+
+    Parameters
+    ----------
+    folder : path-like
+        As :func:`phasemark.matcher.run_sweep` left it.
+    condition, trial : int
+        As in its trials.csv.
+
+    Returns
+    -------
+    Frames
+        (1, n_frames, rows, cols).
+
+    Raises
+    ------
+    InputFileError
+        The folder holds no sweep.
+    UsageError
+        The sweep has no such trial.
+    """
+    plan = read_plan_of(folder)
+    n = len(plan.conditions())
+    if not 0 <= condition < n:
+        raise UsageError(f"{folder}: has conditions 0 … {n - 1}, got {condition}")
+    most = (plan.until_percent is not None and plan.max_trials) or plan.trials
+    if not 0 <= trial < most:
+        raise UsageError(f"{folder}: has trials 0 … {most - 1} of a condition, got {trial}")
+    job = SweepJob(plan, Round.first_of(plan))
+    return job.raw_frames(condition, job.image(condition, job.views(condition, trial, trial + 1)), trial)
 
 
 def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cell, ...]:
