@@ -113,6 +113,7 @@ def stretch_of(sensor: Sensor, theta: _Float) -> float:
     return float(np.nan_to_num(xx * yy - xy * xy).min())
 
 
+@dataclass(eq=False)
 class CalibrationModel:
     """Renders a landmark from known poses for any mounting.
 
@@ -142,43 +143,42 @@ class CalibrationModel:
         Whether ranges are those of the nearest target that the chip of a direct sensor reports, not means over a zone.
     """
 
-    def __init__(
-        self,
-        mesh: trimesh.Trimesh,
-        sensor: Sensor,
-        poses: KnownPoses,
-        *,
-        albedo: float,
-        background: Background | None = None,
-        reports_z: bool = False,
-        workers: int = 1,
-        rendered: Callable[[], None] = lambda: None,
-        track: PoseTrack | None = None,
-        stamp_s: _Float | None = None,
-        one: OneFrequency | None = None,
-        chip: bool = False,
-    ) -> None:
-        self.scale = natural_units(sensor)
+    mesh: trimesh.Trimesh
+    sensor: Sensor
+    poses: KnownPoses
+    albedo: float
+    background: Background | None = None
+    reports_z: bool = False
+    workers: int = 1
+    rendered: Callable[[], None] = lambda: None
+    track: PoseTrack | None = None
+    stamp_s: _Float | None = None
+    one: OneFrequency | None = None
+    chip: bool = False
+
+    def __post_init__(self) -> None:
+        """Make what renders, and group the poses by what stands behind the landmark."""
+        self.scale = natural_units(self.sensor)
         """Natural units, in the order of :data:`ALL_NAMES`; those of the lens of this sensor."""
         self.step = np.where(np.isin(ALL_NAMES, TERMS), self.scale / math.radians(1.0), 1.0) * STEP
         """Half the width of a difference in each: for terms of the lens, what moves the image by :data:`STEP`."""
-        self.sensor, self.poses, self.workers, self._rendered = sensor, poses, workers, rendered
-        self._track, self._stamp_s = track, stamp_s
-        self._axis_cosine = sensor.axis_cosine() if reports_z else None
-        self._albedo = albedo
-        if chip:
-            self._renderer: Renderer = ChipRenderer(mesh, sensor, albedo=albedo)
-        elif one is None:
-            self._renderer = Renderer(mesh, sensor, albedo=albedo, harmonics=())
-        else:
-            self._renderer = OneFrequencyRenderer(Renderer(mesh, one.camera, albedo=albedo, harmonics=()), one)
-        self._scenes = [(np.arange(len(poses)), background)]
-        if poses.wall_m is not None:
-            base = background or Background()
+        self._axis_cosine = self.sensor.axis_cosine() if self.reports_z else None
+        self._renderer = self._rendering()
+        self._scenes = [(np.arange(len(self.poses)), self.background)]
+        if self.poses.wall_m is not None:
+            base = self.background or Background()
             self._scenes = [
-                (np.flatnonzero(poses.wall_m == wall), replace(base, wall_m=float(wall)))
-                for wall in np.unique(poses.wall_m)
+                (np.flatnonzero(self.poses.wall_m == wall), replace(base, wall_m=float(wall)))
+                for wall in np.unique(self.poses.wall_m)
             ]
+
+    def _rendering(self) -> Renderer:
+        """Return what renders the landmark alone, in the frequency and by the chip of the frames."""
+        if self.chip:
+            return ChipRenderer(self.mesh, self.sensor, albedo=self.albedo)
+        camera = self.sensor if self.one is None else self.one.camera
+        plain = Renderer(self.mesh, camera, albedo=self.albedo, harmonics=())
+        return plain if self.one is None else OneFrequencyRenderer(plain, self.one)
 
     def mounting(self, theta: _Float) -> Mounting:
         """Return the mounting that numbers in the order of :data:`ALL_NAMES` mean."""
@@ -276,7 +276,7 @@ class CalibrationModel:
         views = self._views(theta, shift)
         image = self._render(mounting, views)
         alone = image
-        brighter = mounting.albedo / self._albedo - 1
+        brighter = mounting.albedo / self.albedo - 1
         if self.has_background and (brighter or need_alone):
             alone = self._render(mounting, views, alone=True)
         turn = self._turn(mounting, image)
@@ -385,8 +385,8 @@ class CalibrationModel:
 
     def poses_at(self, theta: _Float) -> tuple[_Float, _Float]:
         """Return the view of each frame and its rates per second, (K, 6) each; the rates are 0 at rest."""
-        if self._track is not None and self._stamp_s is not None:
-            return self._track.at(self._stamp_s + theta[ALL_NAMES.index("delay")])
+        if self.track is not None and self.stamp_s is not None:
+            return self.track.at(self.stamp_s + theta[ALL_NAMES.index("delay")])
         still = np.column_stack([getattr(self.poses, name) for name in VIEW_FIELDS])
         return still, np.zeros_like(still)
 
@@ -399,7 +399,7 @@ class CalibrationModel:
     def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:
         renderer = self._renderer.seen_by(mounting.on(self.sensor))
         vertices = self._renderer.topology.vertices
-        self._rendered()
+        self.rendered()
 
         def seen(views: Views, background: Background | None) -> PhasorImages:
             if background is not None:
