@@ -17,12 +17,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data.files.json_text import finite_or_none
 from phasemark.matcher.accuracy.appearance import class_distances_squared
-from phasemark.matcher.accuracy.cramer_rao import (
-    confusion_probability,
-    cramer_rao,
-    image_and_slopes,
-    whitened_slopes,
-)
+from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao, image_and_slopes, whitened_slopes
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.systematic import (

@@ -277,13 +277,7 @@ class TrialSummary:
 
 
 def noisy_frames(
-    renderer: Renderer,
-    sensor: Sensor,
-    views: Views,
-    setup: TrialSetup,
-    rng: np.random.Generator,
-    *,
-    workers: int = 1,
+    renderer: Renderer, sensor: Sensor, views: Views, setup: TrialSetup, rng: np.random.Generator, *, workers: int = 1
 ) -> FilteredFrames:
     """Render views, take frames and filter them."""
     image = renderer.render_views(views, background=setup.background, workers=workers)
@@ -357,12 +351,7 @@ def run_trials(
 
 
 def judged(
-    matches: Matches,
-    class_name: str,
-    views: Views,
-    bound: NDArray[np.float64],
-    free: tuple[str, ...],
-    symmetry: int,
+    matches: Matches, class_name: str, views: Views, bound: NDArray[np.float64], free: tuple[str, ...], symmetry: int
 ) -> Trials:
     """Compare matches of a landmark with the views that its frames were taken from.
 

@@ -133,11 +133,7 @@ class KnownPoses:
 
     @classmethod
     def polar(
-        cls,
-        distance_m: ArrayLike,
-        delta_rad: ArrayLike,
-        bearing_rad: ArrayLike = 0.0,
-        height_m: ArrayLike = 0.0,
+        cls, distance_m: ArrayLike, delta_rad: ArrayLike, bearing_rad: ArrayLike = 0.0, height_m: ArrayLike = 0.0
     ) -> KnownPoses:
         """Take distances and angles; scalars hold for all poses."""
         arrays = np.broadcast_arrays(
@@ -213,10 +209,7 @@ class PoseStd:
 
 
 def read_poses(
-    path: str | os.PathLike[str],
-    *,
-    landmark_xy_m: tuple[float, float] = (0.0, 0.0),
-    landmark_yaw_rad: float = 0.0,
+    path: str | os.PathLike[str], *, landmark_xy_m: tuple[float, float] = (0.0, 0.0), landmark_yaw_rad: float = 0.0
 ) -> KnownPoses:
     """Read a CSV file with one pose a line and a header.
 

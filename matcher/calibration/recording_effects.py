@@ -26,20 +26,11 @@ _Float = NDArray[np.float64]
 
 TURN = "turn"
 """By how much the landmark is turned against the axes of the poses, counter-clockwise: no number of the camera."""
-_BETWEEN = {
-    "range_offset": 0.005,
-    "bearing": math.radians(0.8),
-    "pitch": math.radians(0.8),
-    "roll": math.radians(0.8),
-}
+_BETWEEN = {"range_offset": 0.005, "bearing": math.radians(0.8), "pitch": math.radians(0.8), "roll": math.radians(0.8)}
 """Standard deviation of the difference of two recordings, where there is but one, metres and radians: about that of
 recordings of a VL53L5CX on a drone, calibrated one by one; two had range offsets of −6 and −15 mm, pitches of −0.5° and
 −2.4°."""
-_USUAL = {
-    **{name: 0.8 * std for name, std in _BETWEEN.items()},
-    "delay": 0.2,
-    TURN: math.radians(0.5),
-}
+_USUAL = {**{name: 0.8 * std for name, std in _BETWEEN.items()}, "delay": 0.2, TURN: math.radians(0.5)}
 """Usual standard deviations of the errors of a recording, metres, radians, seconds. Of those above they are a little
 more than the 1/√2 that two alike make, for an error that is stated too small is worse than one too large."""
 _WORTH = 3.0

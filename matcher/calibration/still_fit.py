@@ -388,11 +388,7 @@ class StillFit:
 
         found = [
             optimize.minimize(
-                cost,
-                start,
-                method="Nelder-Mead",
-                bounds=_STD_BOUNDS,
-                options={"xatol": 0.02, "fatol": 0.02},
+                cost, start, method="Nelder-Mead", bounds=_STD_BOUNDS, options={"xatol": 0.02, "fatol": 0.02}
             )
             for start in _STD_STARTS
         ]

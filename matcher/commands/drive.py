@@ -35,14 +35,7 @@ def drive_robot(
     example
         Print the plan of that tour, and do nothing else.
     """
-    from phasemark.matcher.drive import (
-        OUTPUTS,
-        default_drive,
-        example_drive,
-        read_drive_plan,
-        run_drive,
-        write_drive,
-    )
+    from phasemark.matcher.drive import OUTPUTS, default_drive, example_drive, read_drive_plan, run_drive, write_drive
 
     if example:
         return echo(example_drive().removesuffix("\n"))

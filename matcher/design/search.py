@@ -181,10 +181,7 @@ class Search:
             chosen = tuple(int(k) for k in carried[picked])
             distance = float(least[np.ix_(picked, picked)].min()) if n > 1 else math.inf
         turn = self.turn(box)
-        checks = (
-            *self.allowed.checks(box_alone(box, self.plan)),
-            *self._seen_checks(bound, distance, turn),
-        )
+        checks = (*self.allowed.checks(box_alone(box, self.plan)), *self._seen_checks(bound, distance, turn))
         return Candidate(box, bound, chosen, distance, turn, checks, refined)
 
     def _carries(self, box: Box, upper: Upper) -> bool:

@@ -311,12 +311,7 @@ class _Trials:
     """The changes tried on one frame, by matchers that have the settings of the one that refused it."""
 
     def __init__(
-        self,
-        matcher: Matcher,
-        frame: FilteredFrames,
-        background: Background | None,
-        refused: Match,
-        stack: ExitStack,
+        self, matcher: Matcher, frame: FilteredFrames, background: Background | None, refused: Match, stack: ExitStack
     ) -> None:
         told = matcher.options
         self.nearest, self.stack = matcher.method == "nearest", stack
@@ -417,11 +412,7 @@ class _Trials:
         return match if self._counts(match) else None
 
     def _bearing(
-        self,
-        rough: Fit | None,
-        frame: FilteredFrames,
-        background: _Behind,
-        before: tuple[Change, ...],
+        self, rough: Fit | None, frame: FilteredFrames, background: _Behind, before: tuple[Change, ...]
     ) -> _Found:
         """Match a frame with the bearing free, where a rough fit promises something."""
         if rough is None:
@@ -545,12 +536,7 @@ class _Trials:
         return None if fit is None or not _is_promising(fit) else fit
 
     def _match_window(
-        self,
-        rough: Fit,
-        frame: FilteredFrames,
-        sensor: Sensor,
-        free: Sequence[str] | None,
-        background: _Behind,
+        self, rough: Fit, frame: FilteredFrames, sensor: Sensor, free: Sequence[str] | None, background: _Behind
     ) -> Match | None:
         """Match before a small bank of one class about a rough fit; None if it is refused."""
         window_steps = 4

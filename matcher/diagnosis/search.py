@@ -92,12 +92,7 @@ class Search:
         """Whether all classes stand on the same lower part."""
 
     def best(
-        self,
-        frame: FilteredFrames,
-        background: Background | None,
-        *,
-        sizes: Sequence[float] = (1.0,),
-        bearing: bool,
+        self, frame: FilteredFrames, background: Background | None, *, sizes: Sequence[float] = (1.0,), bearing: bool
     ) -> Fit | None:
         """Return the best fit to one frame; None if it has no returns or no view can be rendered.
 

@@ -81,10 +81,7 @@ class Path:
 
 
 def pan_towards(
-    pose: Sequence[float] | NDArray[np.float64],
-    target_m: ArrayLike,
-    pan_offset_m: ArrayLike,
-    lens_offset_m: ArrayLike,
+    pose: Sequence[float] | NDArray[np.float64], target_m: ArrayLike, pan_offset_m: ArrayLike, lens_offset_m: ArrayLike
 ) -> float:
     """Return the pan angle that points the optical axis at a point, radians in (−π, π].
 

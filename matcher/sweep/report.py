@@ -26,13 +26,7 @@ from phasemark.matcher.sweep.figures.sheet import SweepFigure, sweep_figures
 from phasemark.matcher.sweep.figures.style import AXIS_LABEL
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan
-from phasemark.matcher.sweep.result_tables import (
-    Cell,
-    SweepTrials,
-    condition_axes,
-    outlier_share,
-    outliers_in_words,
-)
+from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes, outlier_share, outliers_in_words
 from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
 from phasemark.render.figures import RANGE_COLOURS, draw_range, landmark_limits_m
 from phasemark.render.integral.rounding import with_interval
