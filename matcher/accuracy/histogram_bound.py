@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.matcher.accuracy.cramer_rao import moved_walls
 from phasemark.matcher.histograms.direct_matcher import glass_counts
 from phasemark.matcher.histograms.poisson_fit import sums_of_frame
 from phasemark.matcher.histograms.scene_models import FLOOR, WALL, WALL_STEP_M, planes_of
@@ -77,10 +78,8 @@ def histogram_information(
         others: dict[str, Any] = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
         columns.append(renderer.signal(views, background=replace(background, **others), workers=workers)[:, 1])
     if free_wall:
-        assert background is not None
-        assert background.wall_m is not None
-        walls = [replace(background, wall_m=background.wall_m + step) for step in (WALL_STEP_M, -WALL_STEP_M)]
-        columns.append((signal(views, walls[0]) - signal(views, walls[1])) / (2 * WALL_STEP_M))
+        farther, nearer = (signal(views, wall) for wall in moved_walls(background, WALL_STEP_M))
+        columns.append((farther - nearer) / (2 * WALL_STEP_M))
     slopes = np.stack(columns, axis=1)
     zones, bins = here.shape[1:]
     whole = np.empty((len(views), len(columns) + 1, len(columns) + 1))

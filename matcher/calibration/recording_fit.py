@@ -190,10 +190,9 @@ class RecordingFit:
                 one.model.has_background or not (direct or returns_beside(one.model, one.evidence))
                 for one in self.recorded
             )
-        self.edges = edges
+        self.edges, natural = edges, self.recorded[0].model.scale
         self.columns = columns_of(self.free)
-        self.scale = self.recorded[0].model.scale[self.columns]
-        natural = self.recorded[0].model.scale
+        self.scale = natural[self.columns]
         self.prior = np.array([prior_std(name, self.assumed, natural) for name in self.free]) / self.scale
         self.stated_zones = self.sensor.zone_offsets.ravel()
         apart = stated_apart(self.sensor, problem.names)
@@ -376,17 +375,12 @@ class RecordingFit:
         limits = np.log([_SIZE_BOUNDS] * own + [_ZONE_BOUNDS] * self.zones)
         before = np.clip(start.frame if self.single else np.append(start.frame, start.block), 0.5, 20.0)
         log = np.log(np.append(before, [np.clip(start.zone, 0.1, 20.0)] * self.zones))
-        active = np.ones(len(log), bool)
+        each, active = np.arange(len(log)), np.ones(len(log), bool)
         log, best = fitted(log, active)
         dropped = False
         needed = 2.71  # −2 log likelihood that a size of errors must gain (5 %, one-sided), or it is taken to be zero
         while active[:own].any():
-            without = []
-            for i in np.flatnonzero(active[:own]):
-                fewer = active.copy()
-                fewer[i] = False
-                without.append((cost(log, fewer), i))
-            lowest, i = min(without)
+            lowest, i = min((cost(log, active & (each != i)), i) for i in np.flatnonzero(active[:own]))
             if lowest - best >= needed:
                 break
             active[i], best, dropped = False, lowest, True

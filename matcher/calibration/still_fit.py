@@ -229,18 +229,15 @@ class _Linear:
     def gradients(self, residual: _Float, u: _Float) -> tuple[_Float, _Float]:
         """Return the gradients of each pose: by the mounting, (K, p), and by its own errors, (K, q)."""
         own = np.einsum("kqr,kr->kq", self.own_rows, residual) - u
-        eliminated = np.einsum("kpq,kq->kp", self.cross, self._solved(own))
+        eliminated = np.einsum("kpq,kq->kp", self.cross, self.solved(own))
         return np.einsum("kpr,kr->kp", self.rows, residual) - eliminated, own
 
     def own_step(self, own_gradient: _Float, step: _Float) -> _Float:
         """Return by how much each pose's errors move with a step of the mounting, (K, q)."""
-        return self._solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
+        return self.solved(own_gradient - np.einsum("kpq,p->kq", self.cross, step))
 
-    def own_promise(self, own_gradient: _Float) -> float:
-        """Return by how much the cost would fall if the errors of the poses alone changed."""
-        return float((own_gradient * self._solved(own_gradient)).sum())
-
-    def _solved(self, own_gradient: _Float) -> _Float:
+    def solved(self, own_gradient: _Float) -> _Float:
+        """Return by how much each pose's errors would move if the mounting stayed, (K, q)."""
         return np.asarray(np.linalg.solve(self.own, own_gradient[..., None])[..., 0])
 
 
@@ -493,7 +490,7 @@ class StillFit:
             matrix = matrix + damping * np.diag(np.maximum(np.diag(matrix), 1e-12))
             step = self.scale * np.linalg.lstsq(matrix, self.scale * gradient, rcond=1e-14)[0]
             step /= max(1.0, float(np.abs(step / self.scale).max()) / LONGEST_STEP)
-            if float(gradient @ step) + linear.own_promise(own_gradient) < settled:
+            if float(gradient @ step) + float((own_gradient * linear.solved(own_gradient)).sum()) < settled:
                 break
             there = self._stepped(place, linear, own_gradient, step)
             gain = place.cost - there.cost

@@ -362,14 +362,8 @@ class SweepPlan(ScenePlan):
         low = np.array([min(values) for values in axes.values()])
         high = np.array([max(values) for values in axes.values()])
         table = low + unit * (high - low)
-        points = []
-        for row in table:
-            point = dict(zip(axes, row.tolist(), strict=True))
-            for name in _WHOLE:
-                if name in point:
-                    point[name] = round(point[name])
-            points.append(point)
-        return points
+        table = np.where([name in _WHOLE for name in axes], table.round(), table)
+        return [dict(zip(axes, row, strict=True)) for row in table.tolist()]
 
     def greatest_distances_m(self) -> dict[str, float]:
         """Return the far end of the axes of distances, and of the banks, metres."""

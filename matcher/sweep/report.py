@@ -85,7 +85,7 @@ def _page(
     return page_template("phasemark.matcher.sweep", "page.html.j2").render(
         plan=plan,
         answer=answer(landmarks),
-        card=None if card is None else f"{_first_class(landmarks)} {card.line()}",
+        card=None if card is None else f"{answer_cells(landmarks)[0].condition.class_name} {card.line()}",
         summary=summary(trials, cells),
         contents=[_SEEN, *(one["title"] for one in shown), "Cells", _EXAMPLES, "How it was made", _AGAIN],
         gallery=_gallery(job),
@@ -97,7 +97,7 @@ def _page(
             "bound on D (mm)", "RMSE / bound, D", "RMSE of δ (°)", "bound on δ (°)", "RMSE / bound, δ",
             "share of classes right", "NEES per parameter", "coverage of the 95 % ellipsoid",
         ),
-        rows=[_row(cell, axes) for cell in _worst_first(landmarks)[:most_rows]],
+        rows=[_row(cell, axes) for cell in sorted(landmarks, key=_rank, reverse=True)[:most_rows]],
         n_cells=len(landmarks),
         facts=_facts(plan, trials),
         commands=_commands(plan, folder),
@@ -202,10 +202,6 @@ def _rank(cell: Cell) -> tuple[float, float]:
     return outlier_share([cell]), _badness(cell)
 
 
-def _worst_first(cells: Sequence[Cell]) -> list[Cell]:
-    return sorted(cells, key=_rank, reverse=True)
-
-
 def _with_interval(one: Interval) -> str:
     return with_interval(one.value, one.low, one.high) if math.isfinite(one.value) else "–"
 
@@ -219,10 +215,6 @@ def _row(cell: Cell, axes: Sequence[str]) -> list[str]:
         out.append(_with_interval(cell.ratio[name]))
     out += [_with_interval(one) for one in (cell.class_right, cell.nees, cell.coverage[0.95])]
     return out
-
-
-def _first_class(cells: Sequence[Cell]) -> str:
-    return answer_cells(cells)[0].condition.class_name
 
 
 def _commands(plan: SweepPlan, folder: Path) -> list[str]:
