@@ -30,7 +30,7 @@ from phasemark.data.commands.options import (
     a_class,
 )
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
-from phasemark.matcher.commands.calibrate_rig import calibrate_rig_file
+from phasemark.matcher.commands.locate import calibrate_rig_file
 
 if TYPE_CHECKING:
     from trimesh import Trimesh
