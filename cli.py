@@ -23,8 +23,6 @@ from phasemark.matcher.commands import (
     accuracy,
     bank_trials,
     calibrate,
-    design,
-    drive,
     live,
     locate,
     match,
@@ -116,11 +114,11 @@ def _add_commands(group: str, purpose: str, *functions: Callable[..., None]) -> 
 _add_commands(
     "", "",
     render.render_frame, match.match_frames, calibrate.calibrate_camera, locate.locate_rig, accuracy.accuracy_line,
-    sweep.demo_report, drive.drive_robot, live.live_poses, warm.warm_kernels,
+    sweep.demo_report, plan.drive_robot, live.live_poses, warm.warm_kernels,
 )  # fmt: skip
 _add_commands(
     "landmark", "The landmarks: the catalogue and mesh files.",
-    landmark.landmark_list, landmark.landmark_show, landmark.landmark_export, design.landmark_design,
+    landmark.landmark_list, landmark.landmark_show, landmark.landmark_export, plan.landmark_design,
     landmark.landmark_check,
 )  # fmt: skip
 _add_commands(

@@ -173,7 +173,7 @@ class CalibrationModel:
             ]
 
     def _rendering(self) -> Renderer:
-        """Return what renders the landmark alone, in the frequency and by the chip of the frames."""
+        """Return the renderer of the landmark, in the frequency and by the chip of the frames."""
         if self.chip:
             return ChipRenderer(self.mesh, self.sensor, albedo=self.albedo)
         camera = self.sensor if self.one is None else self.one.camera

@@ -1,16 +1,19 @@
-"""Commands of ``phasemark plan``: examples, schemas and checks of plans."""
+"""Commands of plans: their examples, schemas and checks, and the runs of a drive and of a design of landmarks."""
 
 # Imports of what computes stand inside the functions: phasemark --help imports this module, and answers at once.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import echo, echo_json
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.inputs import note_plan_too_far
-from phasemark.data.commands.options import Json
+from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers
+from phasemark.data.commands.outputs import output_folder
 
 PlanKind = Annotated[
     Literal["bank", "frames", "scenes", "sweep", "drive", "design"],
@@ -53,3 +56,155 @@ def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = Fals
         echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
     else:
         echo(f"{file}: a plan of kind '{found}', complete and valid")
+
+
+def drive_robot(
+    plan_file: Path | None = None,
+    *,
+    out: Out = Path("out/drive"),
+    seed: Seed = 2005,
+    example: bool = False,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Drive a robot from landmark to landmark, its odometry corrected on the way.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); without it a tour of 20 m.
+    out
+        Folder for tables, summary and figure.
+    example
+        Print the plan of that tour, and do nothing else.
+    """
+    from phasemark.matcher.drive import OUTPUTS, default_drive, example_drive, read_drive_plan, run_drive, write_drive
+
+    if example:
+        return echo(example_drive().removesuffix("\n"))
+    plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
+    note_plan_too_far(plan)
+    with output_folder(out, "drive", OUTPUTS, force, plan):
+        with LongWork("driving, cm") as progress:
+            drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+        with LongWork("drawing"):
+            files = write_drive(drive, out, force=force)
+    facts = drive.as_dict()
+    if as_json:
+        return echo_json({"files": [str(path) for path in files], **facts})
+    _echo_drive(facts)
+    echo(*files)
+
+
+def _echo_drive(facts: Mapping[str, Any]) -> None:
+    """Print the errors of a drive with its odometry alone and with corrections."""
+    echo_table(
+        ("error", "at the end", "largest", "heading at the end", "largest"),
+        (
+            (
+                title,
+                f"{facts[f'{key}_final_position_error_m']:.3f} m",
+                f"{facts[f'{key}_largest_position_error_m']:.3f} m",
+                f"{facts[f'{key}_final_heading_error_deg']:.2f}°",
+                f"{facts[f'{key}_largest_heading_error_deg']:.2f}°",
+            )
+            for title, key in (("dead reckoning", "dead_reckoned"), ("corrected", "corrected"))
+        ),
+    )
+    echo(f"{facts['way_m']:.1f} m, {facts['corrections']} corrections at {facts['stops']} stops")
+
+
+def landmark_design(
+    plan_file: Path | None = None,
+    *,
+    out: Out = Path("out/design"),
+    confirm: Annotated[Index, Shown(metavar="N")] = 100,
+    seed: Seed | None = None,
+    example: bool = False,
+    workers: Workers = None,
+    as_json: Json = False,
+    force: Force = False,
+) -> None:
+    """Design a set of landmarks for a camera and a working range, and confirm what it gains by simulated frames.
+
+    Parameters
+    ----------
+    plan_file
+        A plan (.toml); without it four landmarks for the PMD camera.
+    out
+        Folder for landmarks, tables, pictures and meshes.
+    confirm
+        Simulated frame sets to match from every side; 0: none.
+    seed
+        Replaces the plan's root of all random numbers.
+    example
+        Print the default plan, and do nothing else.
+    """
+    from phasemark.matcher.design import (
+        confirm_design,
+        default_design,
+        example_design,
+        output_names,
+        read_design_plan,
+        run_design,
+        summary,
+        write_design,
+    )
+
+    if example:
+        return echo(example_design().removesuffix("\n"))
+    plan = default_design() if plan_file is None else read_design_plan(plan_file)
+    if seed is not None:
+        plan = plan.model_copy(update={"seed": seed})
+    with output_folder(out, "landmark design", output_names(plan), force, plan):
+        with LongWork("searching") as progress:
+            design = run_design(plan, workers=workers, progress=progress)
+        confirmed = None
+        if confirm:
+            with LongWork("matching simulated frames") as progress:
+                confirmed = confirm_design(design, confirm, workers=workers, progress=progress)
+        with LongWork("writing the design"):
+            files = write_design(design, confirmed, out, force=force)
+    facts = summary(design, confirmed)
+    if as_json:
+        return echo_json({"files": [str(path) for path in files], **facts})
+    _echo_design(facts)
+    echo(*files)
+
+
+def _echo_design(facts: Mapping[str, Any]) -> None:
+    """Print a design beside the catalogue."""
+    from phasemark.render.integral.rounding import with_interval
+
+    def within(interval: Mapping[str, float | None], scale: float) -> str:
+        value, low, high = (
+            math.nan if number is None else scale * number for number in map(interval.get, ("value", "low", "high"))
+        )
+        return with_interval(value, low, high) if math.isfinite(value) else "nothing found"
+
+    sets = [facts["result"], facts["catalogue"]]
+    rows = [
+        ("box (mm)", *(" × ".join(f"{1000 * side:g}" for side in one["landmarks"][0]["box"].values()) for one in sets)),
+        ("looks the same every", *(f"{360 / one['symmetry']:g}°" for one in sets)),
+        ("worst position bound (mm)", *(f"{1000 * one['worst_position_bound_m']:.1f}" for one in sets)),
+        ("median position bound (mm)", *(f"{1000 * one['median_position_bound_m']:.1f}" for one in sets)),
+        ("least d between classes", *(_number(one["least_class_distance"]) for one in sets)),
+        ("least d from itself turned", *(_number(one["turn_distance"]) for one in sets)),
+    ]
+    confirmation = facts["confirmation"]
+    if confirmation:
+        tried = [confirmation["result"], confirmation["catalogue"]]
+        for title, key in (("worst side", "worst"), ("anywhere", "anywhere")):
+            found = (f"{within(one[key]['rmse_m'], 1000)}, N = {one[key]['n']}" for one in tried)
+            rows.append((f"r.m.s. error, {title} (mm)", *found))
+        rows.append(("r.m.s. error / bound, all sides", *(within(one["rmse_over_bound"], 1) for one in tried)))
+        rows.append(("class errors, all sides (%)", *(within(one["class_errors"], 100) for one in tried)))
+    echo_table(("", "new set", "catalogue"), rows)
+    echo(f"worst position bound {facts['bound_factor']:.2f} times lower than the catalogue's")
+    if confirmation:
+        echo(f"worst r.m.s. error {within(confirmation['worst_rmse_factor'], 1)} times lower, 95 % interval")
+
+
+def _number(value: float | None) -> str:
+    return "none" if value is None else f"{value:.1f}"
