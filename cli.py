@@ -23,10 +23,12 @@ from phasemark.matcher.commands import (
     accuracy,
     bank_trials,
     calibrate,
+    characterise,
     live,
     locate,
     match,
     plan,
+    pose,
     sweep,
     warm,
 )
@@ -123,7 +125,7 @@ _add_commands(
 )  # fmt: skip
 _add_commands(
     "sensor", "The cameras: shipped presets and sensor files.",
-    sensor.sensor_list, sensor.sensor_show, sensor.sensor_import, accuracy.sensor_characterise, sensor.sensor_fit,
+    sensor.sensor_list, sensor.sensor_show, sensor.sensor_import, characterise.sensor_characterise, sensor.sensor_fit,
     sensor_direct.sensor_fit_direct,
 )  # fmt: skip
 _add_commands(
@@ -134,7 +136,7 @@ _add_commands(
     "sweep", "Accuracy sweeps: errors of each method over conditions, with intervals.",
     sweep.sweep_run, sweep.sweep_report, sweep.sweep_frames, sweep.sweep_compare,
 )  # fmt: skip
-_add_commands("pose", "Measured poses against true ones.", accuracy.pose_report)
+_add_commands("pose", "Measured poses against true ones.", pose.pose_report)
 _add_commands(
     "frames", "Sets of noisy frames with their truth.",
     frames.frames_build, frames.frames_info, frames.frames_verify, frames.frames_merge, frames.frames_export,

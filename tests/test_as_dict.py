@@ -14,8 +14,8 @@ from phasemark.data import BankPlan, FramePlan, build_bank, build_frames
 from phasemark.landmarks import build_mesh, catalog, check_mesh
 from phasemark.matcher import Match, Matcher, robot_poses
 from phasemark.matcher.position.robot_pose import RobotPose
+from phasemark.matcher.sweep.compare import Difference
 from phasemark.matcher.sweep.plan import Condition
-from phasemark.matcher.sweep.result_tables import Difference
 from phasemark.render import Background, Renderer, Views, preset
 
 ROOT = Path(phasemark.__file__).parent

@@ -43,8 +43,8 @@ from phasemark.matcher.design import (
     write_design,
 )
 from phasemark.matcher.design.measures import box_alone, upper_appearance
-from phasemark.matcher.design.rules import Lattice, neighbours, sample_boxes, sample_uppers
 from phasemark.matcher.design.search import Search
+from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
 from phasemark.matcher.statistics import ratio_interval, rms_interval
 from phasemark.render import Renderer, Views, capture, preset
 

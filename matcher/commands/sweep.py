@@ -129,7 +129,7 @@ def sweep_compare(
     all_
         Show differences that may be chance, too.
     """
-    from phasemark.matcher.sweep.result_tables import compare_cells
+    from phasemark.matcher.sweep.compare import compare_cells
     from phasemark.matcher.sweep.run import read_sweep
 
     found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))

@@ -32,16 +32,8 @@ from phasemark.matcher.design.measures import (
     upper_appearance,
 )
 from phasemark.matcher.design.plan import DesignPlan
-from phasemark.matcher.design.rules import (
-    AllowedDimensions,
-    Check,
-    Lattice,
-    box_of,
-    neighbours,
-    sample_boxes,
-    sample_uppers,
-    upper_size,
-)
+from phasemark.matcher.design.rules import AllowedDimensions, Check, upper_size
+from phasemark.matcher.design.shapes import Lattice, box_of, neighbours, sample_boxes, sample_uppers
 from phasemark.render import Sensor
 
 _BOX_MOVES = (8, 4, 2, 1)
