@@ -87,7 +87,7 @@ class Condition:
     bounces: int = 0
 
     def background(self, *, bounces: bool = True) -> Background | None:
-        """Return what stands behind the landmark, with light that bounces there or without; None: nothing."""
+        """Return wall and floor behind the landmark, with light that bounces or without; None: there is neither."""
         if not (self.wall_m or self.floor_m):
             return None
         return Background(self.wall_m or None, self.floor_m or None, bounces=self.bounces if bounces else 0)
