@@ -197,6 +197,23 @@ def test_foreign_frames_are_matched_where_light_bounces_off_a_floor_of_unknown_a
     assert not direct.any()  # without bounces the frames are refused
 
 
+def test_renderers_of_a_landmark_share_its_patches_and_those_of_an_albedo_the_light(
+    mesh: trimesh.Trimesh, sensor: Sensor, renderer: Renderer
+) -> None:
+    behind = replace(BEHIND, bounces=1)
+    first, again = renderer.render(1.0, background=behind), Renderer(mesh.copy(), sensor, albedo=renderer.albedo)
+    np.testing.assert_array_equal(again.render(1.0, background=behind).phasor, first.phasor)
+    darker = Renderer(mesh, sensor, albedo=0.5 * renderer.albedo)
+    darker.render(1.0, background=behind)
+    one, other, third = (each._standing for each in (renderer, again, darker))
+    assert one is other
+    assert third is not one
+    assert one is not None
+    assert third is not None
+    assert one._stands
+    assert one._stands == third._stands
+
+
 def test_light_that_bounces_unmodelled_is_in_the_covariance(
     known: dict[str, Any], renderer: Renderer, bank: Bank
 ) -> None:

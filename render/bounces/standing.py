@@ -134,7 +134,7 @@ _SHARING = Lock()
 _STANDS: WeakValueDictionary[tuple[Any, ...], Stand] = WeakValueDictionary()
 _LIGHTS: dict[tuple[Any, ...], StandingLight] = {}
 _MOST_LIGHTS = 4
-"""Lights that are kept for renderers to come, those used last; each has some 100 MB."""
+"""Lights that are kept for renderers to come, those used last; each has some 150 MB."""
 
 
 def standing_light(mesh: MeshTopology, albedo: float, sensor: Sensor, frequencies_hz: Sequence[float]) -> StandingLight:
