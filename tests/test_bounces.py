@@ -221,6 +221,21 @@ def _reference(name: str) -> tuple[Scene, Sensor, dict[str, Any]]:
     return Scene(bodies), sensor, arrays
 
 
+def test_light_bounces_only_to_faces_that_something_lies_before() -> None:
+    sensor = preset("pmd-16x16").with_(lamp_half_angle_deg=40)
+    wall = Body.plane((6, 6), albedo=0.5, pose=_pose((1, 0.2, 0), (-0.98, -0.2, 0)), name="wall")
+    box = Body(trimesh.creation.box((0.2, 0.2, 0.3)), 0.8, "box")
+    camera = trimesh.transformations.rotation_matrix(math.atan2(0.2, 0.98), [0, 0, 1])
+    camera[:3, 3] = -0.98, -0.2, 0
+    for bodies in ([box, wall], [box], [wall]):
+        scene = Scene(bodies)
+        image, direct = (SceneRenderer(scene, sensor, bounces=k).phasors(camera) for k in (1, 0))
+        extra = np.abs(image.phasor - direct.phasor)[0] / np.abs(direct.phasor).max()
+        # the front of the box looks away from the wall, its side and the wall see one another
+        assert extra[6:10, 4:10].max() == 0
+        assert (extra.max() > 1e-3) == (len(bodies) == 2)
+
+
 def test_a_lamp_that_fades_dims_direct_light_and_even_light_is_that_of_no_lamp() -> None:
     bodies, sensor = _corner()
     plain, even, fading, sampled = (

@@ -179,6 +179,7 @@ def make_patches(
     size_at: SizeAt,
     *,
     intersector: str = "auto",
+    before_others: bool = False,
 ) -> Patches:
     """Cut the surfaces of a scene into patches.
 
@@ -194,8 +195,10 @@ def make_patches(
         Largest extent of a patch.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
+    before_others : bool
+        Whether surfaces that are not of the scene, as a wall somewhere behind it, send light to every outer side.
     """
-    lift = _LIFT * float((topology.high - topology.low).max())
+    lift = _lift_of(topology)
     normals = topology.planes[:, :3]
     triangles, face, sizes = _cut(
         topology.vertices[topology.faces], np.arange(len(topology.faces)), lambda at, own: size_at(at, normals[own])
@@ -207,8 +210,20 @@ def make_patches(
     edges = triangles[:, 1:] - triangles[:, :1]
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     facets = Facets(triangles, topology.planes[face, :3], areas, face)
-    useful = ~buried & _has_something_before(facets, topology, lift)
-    return _joined(facets, useful, topology, sizes, intersector, lift)
+    outer = np.column_stack([np.ones(len(face), np.bool_), ~topology.closed[face]])
+    lit = outer if before_others else _has_something_before(facets, topology, lift)
+    return _joined(facets, lit, ~buried, topology, sizes, intersector, lift)
+
+
+def light_bounces(topology: MeshTopology) -> bool:
+    """Return whether something of a scene lies before any side of its faces: otherwise light bounces nowhere."""
+    corners = topology.vertices[topology.faces]
+    faces = Facets(corners, topology.planes[:, :3], np.zeros(len(corners)), np.arange(len(corners)))
+    return bool(_has_something_before(faces, topology, _lift_of(topology)).any())
+
+
+def _lift_of(topology: MeshTopology) -> float:
+    return _LIFT * float((topology.high - topology.low).max())
 
 
 def _longest(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -319,16 +334,20 @@ class _Runs:
 
 def _joined(
     facets: Facets,
-    useful: NDArray[np.bool_],
+    lit: NDArray[np.bool_],
+    open_to_air: NDArray[np.bool_],
     topology: MeshTopology,
     sizes: NDArray[np.float64],
     intersector: str,
     lift: float,
 ) -> Patches:
-    """Join facets into patches no larger than `sizes`, (f,); `useful`, (f, 2), says which sides are wanted."""
+    """Join facets into patches no larger than `sizes`, (f,).
+
+    Sides that light may arrive at, `lit`, (f, 2), and that are not inside a body, `open_to_air`, are joined.
+    """
     centres, albedo = facets.corners.mean(axis=1), topology.albedo[facets.face]
     body = topology.part[facets.face]
-    side, members = np.nonzero(useful.T)
+    side, members = np.nonzero((lit & open_to_air).T)
     _, kind = np.unique(np.column_stack([side, body[members], albedo[members]]), axis=0, return_inverse=True)
     own = _grouped(members, kind.ravel(), facets, centres, sizes)
     patch_of = np.full((len(facets.face), 2), -1)
@@ -350,7 +369,7 @@ def _joined(
         members,
         np.append(runs.first, len(members)),
         np.asarray(sign),
-        _nearest_patch(patch_of, facets, centres, centre, body),
+        _nearest_patch(patch_of, lit, centres, body),
         points,
         normals * sign[:, None, None],
         weights,
@@ -465,18 +484,14 @@ def _spread(
 
 
 def _nearest_patch(
-    patch_of: NDArray[np.int64],
-    facets: Facets,
-    centres: NDArray[np.float64],
-    centre: NDArray[np.float64],
-    body: NDArray[np.int32],
+    patch_of: NDArray[np.int64], lit: NDArray[np.bool_], centres: NDArray[np.float64], body: NDArray[np.int32]
 ) -> NDArray[np.int64]:
-    """Give facets that are in no patch, those mostly inside a closed body, to the nearest patch of their side."""
+    """Give facets mostly inside a closed body to the nearest patch of their side; others that are not lit have none."""
     out = patch_of.copy()
     for side in range(2):
         for b in np.unique(body):
             own = np.flatnonzero(body == b)
-            kept, left = own[patch_of[own, side] >= 0], own[patch_of[own, side] < 0]
+            kept, left = own[patch_of[own, side] >= 0], own[(patch_of[own, side] < 0) & lit[own, side]]
             if len(kept) and len(left):
                 _, near = cKDTree(centres[kept]).query(centres[left])
                 out[left, side] = patch_of[kept[near], side]

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.render.background import Background, Bounces, parameters_of_views
 from phasemark.render.bounces.bounced_light import check_bounces, refined
+from phasemark.render.bounces.patches import light_bounces
 from phasemark.render.direct.bin_counts import detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of, zones_tile
 from phasemark.render.direct.histogram_images import HistogramImages
@@ -223,6 +224,10 @@ class SceneRenderer:
     ) -> NDArray[np.complex128]:
         """Return the light that has bounced, (pixels of all poses, frequencies, powers)."""
         mesh = assembly.in_facets()
+        if not light_bounces(mesh.topology):
+            return np.zeros(
+                (len(poses.lens) * self.sensor.rows * self.sensor.cols, len(frequencies_hz), 1), np.complex128
+            )
         light = refined(mesh.topology, mesh.intersector, self.sensor, poses, self.bounce_tolerance, self._intersector)
         found = light.phasors(frequencies_hz, self.bounces, self.bounce_tolerance, free)
         return found.reshape(-1, *found.shape[2:])
