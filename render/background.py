@@ -85,6 +85,11 @@ class Background:
         """Whether matching estimates the floor's albedo."""
         return bool(self.bounces and self.floor_m and self.floor_albedo_std)
 
+    def moved_walls(self, step_m: float) -> list[Background]:
+        """Return it with its wall a step farther away, and a step nearer; there has to be a wall."""
+        assert self.wall_m is not None
+        return [replace(self, wall_m=self.wall_m + step) for step in (step_m, -step_m)]
+
     def parameters(self) -> NDArray[np.float64]:
         """Return (wall_m, floor_m, wall_albedo, floor_albedo, bounces); 0: a plane that is not there, inf: all."""
         bounces = math.inf if self.bounces == "all" else self.bounces

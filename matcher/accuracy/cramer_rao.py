@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -187,7 +187,8 @@ def cramer_rao(
                 assert background is not None
                 columns.append(((image.phasor - alone) / background.wall_albedo)[:, None])
             else:
-                walls = moved_walls(background, wall_step_m)
+                assert background is not None
+                walls = background.moved_walls(wall_step_m)
                 sides = [renderer.render_views(views, background=own, workers=workers).phasor for own in walls]
                 columns.append(((sides[0] - sides[1]) / (2 * wall_step_m))[:, None])
     mask = pixel_mask(pixels, sensor if one is None else one.camera)
@@ -229,13 +230,6 @@ def _check_wall(nuisances: Sequence[str], background: Background | None) -> None
     """Refuse a wall among the nuisances where there is none."""
     if (background is None or background.wall_m is None) and set(nuisances) & {"wall_m", "wall_albedo"}:
         raise UsageError("a wall can be a nuisance only where there is one: give 'background' a wall")
-
-
-def moved_walls(background: Background | None, step_m: float) -> list[Background]:
-    """Return a background with its wall a step farther away, and a step nearer."""
-    assert background is not None
-    assert background.wall_m is not None
-    return [replace(background, wall_m=background.wall_m + step) for step in (step_m, -step_m)]
 
 
 def image_and_slopes(

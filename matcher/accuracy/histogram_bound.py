@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.accuracy.cramer_rao import moved_walls
 from phasemark.matcher.histograms.direct_matcher import glass_counts
 from phasemark.matcher.histograms.poisson_fit import sums_of_frame
 from phasemark.matcher.histograms.scene_models import FLOOR, WALL, WALL_STEP_M, planes_of
@@ -78,7 +77,8 @@ def histogram_information(
         others: dict[str, Any] = {name: 0.0 for kind, name in _ALBEDOS.items() if kind != plane}
         columns.append(renderer.signal(views, background=replace(background, **others), workers=workers)[:, 1])
     if free_wall:
-        farther, nearer = (signal(views, wall) for wall in moved_walls(background, WALL_STEP_M))
+        assert background is not None
+        farther, nearer = (signal(views, wall) for wall in background.moved_walls(WALL_STEP_M))
         columns.append((farther - nearer) / (2 * WALL_STEP_M))
     slopes = np.stack(columns, axis=1)
     zones, bins = here.shape[1:]

@@ -179,7 +179,7 @@ def make_patches(
     size_at: SizeAt,
     *,
     intersector: str = "auto",
-    before_others: bool = False,
+    before_others: int | None = None,
 ) -> Patches:
     """Cut the surfaces of a scene into patches.
 
@@ -195,8 +195,8 @@ def make_patches(
         Largest extent of a patch.
     intersector : {"auto", "embree", "float64"}
         As for :class:`~phasemark.render.Renderer`.
-    before_others : bool
-        Whether surfaces that are not of the scene, as a wall somewhere behind it, send light to every outer side.
+    before_others : int, optional
+        A body to whose outer sides surfaces that are not of the scene send light, as a wall somewhere behind it.
     """
     lift = _lift_of(topology)
     normals = topology.planes[:, :3]
@@ -210,8 +210,10 @@ def make_patches(
     edges = triangles[:, 1:] - triangles[:, :1]
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
     facets = Facets(triangles, topology.planes[face, :3], areas, face)
-    outer = np.column_stack([np.ones(len(face), np.bool_), ~topology.closed[face]])
-    lit = outer if before_others else _has_something_before(facets, topology, lift)
+    lit = _has_something_before(facets, topology, lift)
+    if before_others is not None:
+        own = topology.part[face] == before_others
+        lit |= np.column_stack([own, own & ~topology.closed[face]])
     return _joined(facets, lit, ~buried, topology, sizes, intersector, lift)
 
 

@@ -98,7 +98,7 @@ class Stand:
     def __init__(self, mesh: MeshTopology, floor_z_m: float | None, kind: str, wave_numbers: Sequence[float]) -> None:
         topology = _with_floor(mesh, floor_z_m)
         size_at = _sizes(mesh, floor_z_m)
-        self.patches = make_patches(topology, size_at, intersector=kind, before_others=floor_z_m is None)
+        self.patches = make_patches(topology, size_at, intersector=kind, before_others=_LANDMARK)
         transport = transport_between(self.patches)
         self.slopes = transport.slopes
         self._gather_groups(size_at)
