@@ -19,7 +19,18 @@ from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.accuracy import accuracy_card, multipath_shift
 from phasemark.matcher.diagnosis.search import wider
 from phasemark.matcher.likelihood.systematic import carried_covariances, carried_errors
-from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views, capture, preset
+from phasemark.render import (
+    Background,
+    Body,
+    PhasorImages,
+    Renderer,
+    Scene,
+    SceneRenderer,
+    Sensor,
+    Views,
+    capture,
+    preset,
+)
 from phasemark.render.bounces import standing
 
 GOLDEN = Path(__file__).parent / "golden" / "multipath.npz"
@@ -195,6 +206,19 @@ def test_foreign_frames_are_matched_where_light_bounces_off_a_floor_of_unknown_a
     assert np.median((errors[:, 0] / errors[:, 1]) ** 2) < 3.0
     direct, _ = _matched(bank, image, BEHIND)
     assert not direct.any()  # without bounces the frames are refused
+
+
+def test_a_box_before_a_wall_alone_returns_the_light_of_the_same_scene() -> None:
+    camera, box = preset("pmd-16x16").with_(lamp_half_angle_deg=40), trimesh.creation.box((0.2, 0.2, 0.3))
+    turned = trimesh.transformations.rotation_matrix(0.2, [0, 0, 1])
+    place, wall = turned.copy(), turned @ trimesh.transformations.rotation_matrix(-np.pi / 2, [0, 1, 0])
+    place[:3, 3], wall[:3, 3] = -turned[:3, 0], turned[:3, 0]
+    scene = Scene([Body(box, 0.8, "box"), Body.plane((6, 6), albedo=0.5, pose=wall, name="wall")])
+    direct, known = (SceneRenderer(scene, camera, bounces=k).phasors(place).phasor for k in (0, 2))
+    found = Renderer(box, camera, albedo=0.8).render(1.0, 0.2, background=Background(wall_m=2.0, bounces=2)).phasor
+    brightest = np.abs(direct).max()
+    assert np.abs(found - known).max() < 5e-4 * brightest
+    assert np.abs(known - direct).max() > 3e-3 * brightest
 
 
 def test_renderers_of_a_landmark_share_its_patches_and_those_of_an_albedo_the_light(
