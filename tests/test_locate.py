@@ -24,19 +24,23 @@ POST = {"from": [1.6, 1.1], "to": [1.9, 1.3], "thickness_m": 0.05}
 
 
 def brute_force_depth(outline, pose, azimuth, step, footprint=2.5, rays=6001):
-    """Mean depth of a column over a triangle of rays, each met with every face."""
+    """Mean depth of a column over a triangle of rays, each met with every face, weighted with its light, cos θ / r²."""
     x, y, yaw = pose
     centre = math.tan(azimuth)
     width = 0.5 * footprint * step * (1 + centre**2)
     tau = centre + width * (np.arange(rays) + 0.5 - rays / 2) / (rays / 2)
     ray = np.stack([np.cos(yaw) - tau * np.sin(yaw), np.sin(yaw) + tau * np.cos(yaw)], axis=-1)
-    nearest = np.full(rays, np.inf)
+    nearest, light = np.full(rays, np.inf), np.zeros(rays)
     for ax, ay, bx, by in outline.pieces:
         across = ray[:, 0] * (by - ay) - ray[:, 1] * (bx - ax)
         depth = ((ax - x) * (by - ay) - (ay - y) * (bx - ax)) / across
         place = ((ax - x) * ray[:, 1] - (ay - y) * ray[:, 0]) / across
-        nearest = np.where((depth > 0) & (place >= 0) & (place <= 1) & (depth < nearest), depth, nearest)
-    return np.average(nearest, weights=1 - np.abs(tau - centre) / width)
+        closer = (depth > 0) & (place >= 0) & (place <= 1) & (depth < nearest)
+        length = np.hypot(1, tau)
+        cosine = np.abs(across) / (length * math.hypot(bx - ax, by - ay))
+        nearest = np.where(closer, depth, nearest)
+        light = np.where(closer, cosine / (depth * length) ** 2, light)
+    return np.average(nearest, weights=light * (1 - np.abs(tau - centre) / width))
 
 
 def model_of(rig, wall_map):

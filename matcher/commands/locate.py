@@ -36,6 +36,7 @@ def locate_rig(
     start_yaw_std: Degrees = 15.0,
     frames: Count | None = None,
     smooth: bool = False,
+    tilt: bool = False,
     map_name: Annotated[str | None, Shown("--map-name", metavar="NAME")] = None,
     tolerance: Metres = 0.1,
     tolerance_yaw: Degrees = 5.0,
@@ -70,6 +71,8 @@ def locate_rig(
         Use that many frames of each stop.
     smooth
         Join the stops of each robot by its odometry.
+    tilt
+        Estimate z, pitch and roll, too, from recordings with rows of zones.
     map_name
         Which map of a file with several; the recording names it otherwise.
     tolerance
@@ -99,7 +102,8 @@ def locate_rig(
             recording = read_rig_recording(path, rig)
             recording = recording if frames is None else recording.first_frames(frames)
             wall_map = read_wall_map(map_file, map_name or recording.map_name)
-            locator = Locator(wall_map, rig, tolerance_m=tolerance, tolerance_rad=math.radians(tolerance_yaw))
+            limits = {"tolerance_m": tolerance, "tolerance_rad": math.radians(tolerance_yaw)}
+            locator = Locator(wall_map, rig, with_tilt=tilt, **limits)
             found = _located(locator, recording, start, odometry, std, smooth)
             drawn.append((recording.run, locator.model.outline, found, None))
             answers += found

@@ -46,7 +46,7 @@ class RigNumbers(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """Frames of one stop."""
+    """Frames of one stop: C columns of each sensor, or its zones row by row."""
 
     time_s: _Float
     """(F,): since the first frame of the stop."""
@@ -64,7 +64,7 @@ class Prediction(NamedTuple):
     depth_m: _Float
     """(F, S, C): NaN where no wall is seen."""
     slope: _Float
-    """(F, S, C, 11)."""
+    """(F, S, C, 11), or 14 in space."""
     spread_m: _Float
     """(F, S, C): of the depth within the footprint."""
     wall_slope: _Float

@@ -19,13 +19,14 @@ from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
 from phasemark.matcher.locate.scan_fit import StopFit, StopModel, fit_stop, std_without_one
 from phasemark.matcher.locate.wall_map import WallMap
+from phasemark.matcher.locate.zones_in_space import SpaceModel
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 _Float = NDArray[np.float64]
 
 LocateReason = Literal["", "no zones", "odometry jumps", "poor fit", "undetermined", "ambiguous"]
-_SAME_FRAMES = 3.0
-"""Frames of a stop that count as one opinion: what the map has wrong is wrong in all of them."""
+_SAME_FRAMES = 3
+"""Frames of a stop that count as one opinion: what the map has wrong is wrong in all of them, and in all rows."""
 _MOST_STARTS, _MOST_REFINED = 32, 12
 _HOPELESS = 4 * DISAGREEMENT
 """Cost by which a start may exceed the best one after a descent on three frames."""
@@ -68,6 +69,9 @@ class LocatedPose:
         What is wrong with the recording there.
     evidence : (pose, information), optional
         Pose and inverse covariance that the stop's frames alone speak for, without the prior and the part of the map.
+    tilt : (values, covariance), optional
+        Height above the map's zero (m), pitch (down) and roll (rad), (3,), and their covariance, (3, 3), where they
+        were asked for.
     """
 
     key: tuple[str, int, int]
@@ -82,6 +86,7 @@ class LocatedPose:
     alternatives: tuple[PoseCandidate, ...] = ()
     note: str = ""
     evidence: tuple[_Float, _Float] | None = None
+    tilt: tuple[_Float, _Float] | None = None
 
     @property
     def pose(self) -> _Float:
@@ -92,6 +97,12 @@ class LocatedPose:
         """Return plain numbers, for JSON: metres and degrees, in the covariance too."""
         unit = np.array([1.0, 1.0, math.degrees(1.0)])
         known = math.isfinite(self.x_m)
+        tilt: dict[str, float] = {}
+        if self.tilt is not None:
+            height, pitch, roll = np.where([True, False, False], self.tilt[0], np.degrees(self.tilt[0])).tolist()
+            std = np.sqrt(np.diag(self.tilt[1]))
+            tilt = {"z_m": height, "pitch_deg": pitch, "roll_deg": roll, "z_std_m": float(std[0])}
+            tilt |= {"pitch_std_deg": math.degrees(std[1]), "roll_std_deg": math.degrees(std[2])}
         return {
             "run": self.key[0],
             "stop": self.key[1],
@@ -100,6 +111,7 @@ class LocatedPose:
             "y_m": self.y_m if known else None,
             "yaw_deg": math.degrees(self.yaw_rad) if known else None,
             "covariance": (self.covariance * np.outer(unit, unit)).tolist() if known else None,
+            **tilt,
             "explained": self.explained,
             "observed": self.observed,
             "accepted": self.accepted,
@@ -123,6 +135,9 @@ class Locator:
         explains the stop may be farther away.
     least_explained : float
         Share of the observed columns that an accepted pose must explain.
+    with_tilt : bool
+        Whether height, pitch and roll are estimated, too, from the zones of recordings with rows: from the poses that
+        the columns have found, in the scene of the map. An answer is accepted by x, y and yaw.
 
     Raises
     ------
@@ -144,6 +159,7 @@ class Locator:
         tolerance_m: float = 0.1,
         tolerance_rad: float = math.radians(5.0),
         least_explained: float = 0.7,
+        with_tilt: bool = False,
     ) -> None:
         for name, value in (("tolerance_m", tolerance_m), ("tolerance_rad", tolerance_rad)):
             if not (math.isfinite(value) and value > 0):
@@ -154,6 +170,8 @@ class Locator:
         self.wall_map, self.rig = wall_map, rig
         self.model = StopModel(rig, wall_map.outline(), rig.numbers())
         self._grid = pose_grid(self.model.outline)
+        self.with_tilt = with_tilt
+        self._in_space: dict[int, SpaceModel] = {}
 
     def locate(
         self,
@@ -179,7 +197,8 @@ class Locator:
         Raises
         ------
         UsageError
-            Starts of a wrong shape, or standard deviations that are not positive.
+            Starts of a wrong shape, standard deviations that are not positive, or a tilt is asked of a recording
+            without rows.
         """
         n = len(recording)
         starts = np.full((n, 3), np.nan) if start is None else np.asarray(start, np.float64)
@@ -255,13 +274,29 @@ class Locator:
 
     def _located(self, recording: RigRecording, k: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
         """Locate one stop; `prior`: mean and covariance."""
-        answer = self.locate_scan(recording.scan(k), prior)
+        answer = self.locate_scan(recording.scan(k), prior, self._zones(recording, k))
         note = recording.notes[k] if recording.notes else ""
         if "odometry jumps" in note:
             answer = replace(answer, accepted=False, reason="odometry jumps")
         return replace(answer, key=recording.key(k), note=note)
 
-    def locate_scan(self, scan: Scan, prior: tuple[_Float, _Float] | None = None) -> LocatedPose:
+    def _zones(self, recording: RigRecording, k: int) -> tuple[SpaceModel, Scan] | None:
+        """Return the zones of a stop and the model of them; None where no tilt is asked for."""
+        if not self.with_tilt:
+            return None
+        if recording.zone_m is None:
+            raise UsageError(f"z, pitch and roll need rows of zones, and '{recording.run}' has columns alone")
+        rows, scan = recording.zone_m.shape[3], recording.zones(k, _SAME_FRAMES)
+        if rows not in self._in_space:
+            self._in_space[rows] = SpaceModel(self.rig, self.model.outline, self.model.numbers, self.wall_map, rows)
+        return None if scan is None else (self._in_space[rows], scan)
+
+    def locate_scan(
+        self,
+        scan: Scan,
+        prior: tuple[_Float, _Float] | None = None,
+        zones: tuple[SpaceModel, Scan] | None = None,
+    ) -> LocatedPose:
         """Locate one stop.
 
         Parameters
@@ -269,6 +304,8 @@ class Locator:
         scan : Scan
         prior : (mean, covariance), optional
             (3,) and (3, 3). None: the whole map is searched.
+        zones : (SpaceModel, Scan), optional
+            Rows of zones, which tell the tilt.
 
         Returns
         -------
@@ -280,19 +317,18 @@ class Locator:
         if not observed:
             return LocatedPose(("", 0, 0))
         fits = self._fits(scan, prior)
+        if zones is not None:
+            fits = self._distinct([fit_stop(*zones, fit.theta, _given(prior), (2.0, 1.0)) for fit in fits])
         if not fits:
             return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
-        return self._answer(scan, fits, prior)
+        return self._answer(*(zones or (self.model, scan)), fits, prior)
 
     def _fits(self, scan: Scan, prior: tuple[_Float, _Float] | None) -> list[StopFit]:
         """Return distinct fits, best first: descents on three frames from a grid, then on all frames."""
         few = np.unique(np.linspace(0, len(scan.time_s) - 1, 3).astype(int))
         thin = Scan(scan.time_s[few], scan.depth_m[few], scan.odometry_time_s, scan.odometry)
-        around, given = None, None
-        if prior is not None:
-            mean, covariance = prior
-            around = (mean, _REACH_SIGMA * np.sqrt(np.diag(covariance)))
-            given = (mean, np.asarray(np.linalg.inv(covariance), np.float64))
+        around = None if prior is None else (prior[0], _REACH_SIGMA * np.sqrt(np.diag(prior[1])))
+        given = _given(prior)
         starts = promising_poses(self._grid, self.model.numbers, thin, _MOST_STARTS, around)
         if prior is not None:
             starts = np.vstack([prior[0], starts])
@@ -322,10 +358,12 @@ class Locator:
     def _tolerance(self) -> _Float:
         return np.array([self.tolerance_m, self.tolerance_m, self.tolerance_rad])
 
-    def _answer(self, scan: Scan, fits: list[StopFit], prior: tuple[_Float, _Float] | None) -> LocatedPose:
+    def _answer(
+        self, model: StopModel, scan: Scan, fits: list[StopFit], prior: tuple[_Float, _Float] | None
+    ) -> LocatedPose:
         """Return the best fit as the answer, or the reason to refuse it, with what explains the stop nearly as well."""
         best = fits[0]
-        opinions = max(1.0, len(scan.time_s) / _SAME_FRAMES)
+        opinions = max(1.0, len(scan.time_s) / _SAME_FRAMES) * model.rows
         excess = np.array([fit.cost - best.cost for fit in fits]) / opinions
         near = [k for k in range(len(fits)) if excess[k] < DISAGREEMENT and fits[k].share >= self.least_explained]
         weight = np.exp(-0.5 * excess)
@@ -337,7 +375,7 @@ class Locator:
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
         reason = self._reason(
-            fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(self.model, scan, best) ** 2)
+            fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(model, scan, best) ** 2)
         )
         return LocatedPose(
             ("", 0, 0),
@@ -351,7 +389,15 @@ class Locator:
             reason=reason,
             alternatives=tuple(candidates),
             evidence=_without(best, prior),
+            tilt=self._tilt(best),
         )
+
+    def _tilt(self, fit: StopFit) -> tuple[_Float, _Float] | None:
+        """Return height, pitch and roll of a fit in space and their covariance, height above the map's zero."""
+        first = len(self.model.longest)
+        if len(fit.theta) == first:
+            return None
+        return fit.theta[first:] + np.array([self.wall_map.height_m, 0.0, 0.0]), fit.covariance[first:, first:]
 
     def _reason(self, fits: list[StopFit], near: list[int], std: _Float) -> LocateReason:
         """Return why the best fit is refused; empty where it is accepted."""
@@ -364,6 +410,11 @@ class Locator:
             if (off + TOLERATED_SIGMA * np.sqrt(np.diag(other.covariance)[:3]) > self._tolerance).any():
                 return "ambiguous"
         return ""
+
+
+def _given(prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float] | None:
+    """Return a prior with the inverse of its covariance."""
+    return None if prior is None else (prior[0], np.asarray(np.linalg.inv(prior[1]), np.float64))
 
 
 def _without(fit: StopFit, prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float]:

@@ -23,12 +23,14 @@ def pose_csv(answers: Sequence[LocatedPose], robot_key: str = "robot") -> str:
     Returns
     -------
     str
-        Alternatives stand as (x y yaw: weight).
+        Alternatives stand as (x y yaw: weight). Height, pitch and roll follow where they were asked for.
     """
     head = ["run", "stop", robot_key, "x_m", "y_m", "yaw_deg", *_COVARIANCE, "accepted", "reason", "explained",
             "observed", "note", "alternatives"]  # fmt: skip
     unit = (1.0, 1.0, math.degrees(1.0))
-    rows = [head]
+    tilts = ["z_m", "pitch_deg", "roll_deg", "z_std_m", "pitch_std_deg", "roll_std_deg"]
+    tilts = tilts if any(one.tilt is not None for one in answers) else []
+    rows = [head + tilts]
     for one in answers:
         covariance = [float(one.covariance[i, j]) * unit[i] * unit[j] for i, j in _COVARIANCE.values()]
         others = " ".join(
@@ -36,5 +38,8 @@ def pose_csv(answers: Sequence[LocatedPose], robot_key: str = "robot") -> str:
         )
         row = [*one.key, one.x_m, one.y_m, math.degrees(one.yaw_rad), *covariance, one.accepted, one.reason,
                one.explained, one.observed, one.note, others]  # fmt: skip
+        if tilts:
+            numbers = one.as_dict()
+            row += [numbers.get(name, math.nan) for name in tilts]
         rows.append([nine_digits(value) for value in row])
     return csv_text(rows)

@@ -57,6 +57,8 @@ class RigRecording:
         Word for `robot` in the recording and in tables made from it.
     notes : tuple of str
         What each stop has wrong: sensors that are stuck, odometry that jumps; empty strings elsewhere.
+    zone_m : (n, F, S, R, C) float64, optional
+        The depths of zones that those of columns were made from, row 0 at the top; None: the recording has no rows.
     """
 
     depth_m: _Float
@@ -69,29 +71,46 @@ class RigRecording:
     map_name: str | None = None
     robot_key: str = "robot"
     notes: tuple[str, ...] = ()
+    zone_m: _Float | None = None
 
     def __len__(self) -> int:
         return len(self.depth_m)
 
-    def scan(self, k: int, frames: Sequence[int] | None = None) -> Scan:
+    def scan(self, k: int, frames: Sequence[int] | NDArray[np.int64] | None = None) -> Scan:
         """Return the frames of a stop, or some of them."""
         used = np.arange(self.depth_m.shape[1]) if frames is None else np.asarray(frames)
         depth, time_s = np.ascontiguousarray(self.depth_m[k][used]), self.time_s[k] - self.time_s[k, 0]
         return Scan(time_s[used], depth, time_s, np.ascontiguousarray(self.moved[k]))
 
+    def zones(self, k: int, most: int) -> Scan | None:
+        """Return the zones of a stop, row by row, in at most `most` of its frames; None without rows or zones."""
+        if self.zone_m is None:
+            return None
+        zones = self.zone_m[k].reshape(*self.zone_m.shape[1:3], -1)
+        used = np.flatnonzero(np.isfinite(zones).any(axis=(1, 2)))
+        if not len(used):
+            return None
+        used = np.unique(used[np.linspace(0, len(used) - 1, most).astype(int)])
+        return self.scan(k, used)._replace(depth_m=np.ascontiguousarray(zones[used]))
+
     def one(self, k: int) -> Self:
         """Return the recording of one stop alone."""
         own = slice(k, k + 1)
         cut = {name: getattr(self, name)[own] for name in ("depth_m", "time_s", "moved", "stop", "robot", "notes")}
-        return replace(self, **cut, odometry=None if self.odometry is None else self.odometry[own])
+        cut |= {name: value[own] for name in ("odometry", "zone_m") if (value := getattr(self, name)) is not None}
+        return replace(self, **cut)
 
     def first_frames(self, n: int) -> Self:
         """Return the recording with the first n frames of each stop; the odometry stays."""
         if not 1 <= n <= self.depth_m.shape[1]:
             raise UsageError(f"'frames' must be 1 … {self.depth_m.shape[1]}, got {n}")
-        depth = self.depth_m.copy()
-        depth[:, n:] = np.nan
-        return replace(self, depth_m=depth)
+        later = np.arange(self.depth_m.shape[1]) >= n
+        return self._without(np.broadcast_to(later[:, None], self.depth_m.shape[:3]))
+
+    def _without(self, dropped: NDArray[np.bool_]) -> Self:
+        """Return the recording without what some sensors measured in some frames, (n, F, S)."""
+        zones = None if self.zone_m is None else np.where(dropped[..., None, None], np.nan, self.zone_m)
+        return replace(self, depth_m=np.where(dropped[..., None], np.nan, self.depth_m), zone_m=zones)
 
     def key(self, k: int) -> tuple[str, int, int]:
         """Return run, stop and robot of a stop."""
@@ -136,9 +155,9 @@ def rig_recording(arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> R
     if not depth.size:
         raise InputFileError(f"{path}: '{name}' must have at least one number, got {depth.shape}")
     n, frames = depth.shape[:2]
-    depth = _valid(depth, arrays, path, rig)
-    depth = _of_sensors(depth, arrays, path, rig)
+    depth = _of_sensors(_valid(depth, arrays, path, rig), arrays, path, rig)
     depth = _as_depth(depth, "range" if name == "range_m" else rig.quantity, rig)
+    zones, depth = (None, depth) if depth.ndim == 4 else (depth, _columns(depth, path, rig))
     times = _needed(arrays, "frame_time_s", path)
     times = _number_array(times, path, "frame_time_s", (n, frames) if times.ndim == 2 else (frames,), True)
     time_s = np.broadcast_to(times, (n, frames))
@@ -155,7 +174,7 @@ def rig_recording(arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> R
     )
     run = str(arrays["run"]) if "run" in arrays else path.stem
     recording = RigRecording(depth, np.ascontiguousarray(time_s), moved, odometry, stop, robot, run,
-                             str(arrays["map"]) if "map" in arrays else None, robot_key)  # fmt: skip
+                             str(arrays["map"]) if "map" in arrays else None, robot_key, zone_m=zones)  # fmt: skip
     return _judged(recording, rig)
 
 
@@ -206,7 +225,7 @@ def _valid(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: R
 
 
 def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
-    """Return the sensors of the rig in its order, rows reduced."""
+    """Return the sensors of the rig in its order."""
     count = depth.shape[2]
     names = [str(name) for name in np.ravel(arrays.get("sensor", rig.names))]
     if len(names) != count:
@@ -214,19 +233,35 @@ def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, r
     for name in rig.names:
         if name not in names:
             raise InputFileError(f"{path}: no sensor '{name}' of the rig, got {', '.join(names)}")
-    depth = depth[:, :, [names.index(name) for name in rig.names]]
-    if depth.ndim == 5:
-        first, last = rig.reduction.rows or (0, depth.shape[3] - 1)
-        if not first <= last < depth.shape[3]:
-            raise InputFileError(f"{path}: 'reduction.rows' of the rig must be within its {depth.shape[3]} rows")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", RuntimeWarning)  # a column without a valid row is NaN
-            reduce = np.nanmedian if rig.reduction.how == "median" else np.nanmean
-            depth = reduce(depth[:, :, :, first : last + 1], axis=3)
     columns = rig.numbers().columns
-    if depth.shape[3] != columns.max():
-        raise InputFileError(f"{path}: has {depth.shape[3]} columns, but the sensors of the rig {columns.max()}")
-    return np.ascontiguousarray(depth, dtype=np.float64)
+    if depth.shape[-1] != columns.max():
+        raise InputFileError(f"{path}: has {depth.shape[-1]} columns, but the sensors of the rig {columns.max()}")
+    return np.ascontiguousarray(depth[:, :, [names.index(name) for name in rig.names]], dtype=np.float64)
+
+
+def reduced_rows(zones_m: _Float, rig: Rig) -> _Float:
+    """Return the depths of columns, (n, F, S, C), each of the valid zones in the rows that the rig names.
+
+    Raises
+    ------
+    UsageError
+        The sensors do not have these rows.
+    """
+    first, last = rig.reduction.rows or (0, zones_m.shape[3] - 1)
+    if not first <= last < zones_m.shape[3]:
+        raise UsageError(f"'reduction.rows' of the rig must be within its {zones_m.shape[3]} rows, got {first, last}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a column without a valid row is NaN
+        reduce = np.nanmedian if rig.reduction.how == "median" else np.nanmean
+        return np.ascontiguousarray(reduce(zones_m[:, :, :, first : last + 1], axis=3))
+
+
+def _columns(zones_m: _Float, path: Path, rig: Rig) -> _Float:
+    """Return the depths of columns of a file with rows."""
+    try:
+        return reduced_rows(zones_m, rig)
+    except UsageError as error:
+        raise InputFileError(f"{path}: {error}") from None
 
 
 def _as_depth(depth: _Float, quantity: str, rig: Rig) -> _Float:
@@ -234,8 +269,12 @@ def _as_depth(depth: _Float, quantity: str, rig: Rig) -> _Float:
     if quantity == "z":
         return depth
     numbers = rig.numbers()
-    azimuth = (0.5 * (numbers.columns[:, None] - 1) - np.arange(depth.shape[3])) * numbers.step_rad[:, None]
-    return np.asarray(depth * np.cos(azimuth))
+    across = np.tan((0.5 * (numbers.columns[:, None] - 1) - np.arange(depth.shape[-1])) * numbers.step_rad[:, None])
+    if depth.ndim == 4:
+        return np.asarray(depth / np.hypot(1.0, across))
+    rows = depth.shape[3]
+    up = np.tan((0.5 * (rows - 1) - np.arange(rows)) * rig.row_steps_rad()[:, None])
+    return np.asarray(depth / np.sqrt(1.0 + across[:, None] ** 2 + up[:, :, None] ** 2))
 
 
 def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: int) -> tuple[_Float, _Float | None]:
@@ -259,7 +298,8 @@ def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: in
 
 def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
     """Leave out sensors that are stuck while the robot moves, and note them and odometry that jumps."""
-    depth, notes = recording.depth_m.copy(), []
+    depth, notes = recording.depth_m, []
+    stuck = np.zeros(depth.shape[:3], np.bool_)
     for k in range(len(recording)):
         moved = recording.moved[k]
         found = []
@@ -271,13 +311,13 @@ def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
                 and len(own) >= _FEWEST_TO_STICK
                 and np.array_equal(own, np.broadcast_to(own[0], own.shape), True)
             ):
-                depth[k, :, s] = np.nan
+                stuck[k, :, s] = True
                 found.append(f"{name} is stuck")
         step = np.abs(np.diff(moved, axis=0)) / np.diff(recording.time_s[k])[:, None]
         if (step[:, :2] > _FASTEST_M_S).any() or (step[:, 2] > _FASTEST_RAD_S).any():
             found.append("odometry jumps")
         notes.append(", ".join(found))
-    return replace(recording, depth_m=depth, notes=tuple(notes))
+    return replace(recording._without(stuck), notes=tuple(notes))
 
 
 def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], _Float]:

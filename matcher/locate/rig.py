@@ -103,13 +103,16 @@ class StopUnknowns(PlanModel):
     """Standard deviations of what differs from stop to stop and is eliminated.
 
     Drift of the odometry while a stop is scanned, age of the data, and of each sensor an offset of its range and of its
-    yaw. A value of 0 leaves one out.
+    yaw; where they are asked for, the robot's height about that of the map, and its pitch and roll about 0. A value of
+    0 leaves one out.
     """
 
     drift_m_s: _Size = 0.015
     age_s: _Size = 0.004
     offset_m: _Size = 0.005
     yaw_deg: _Size = 0.3
+    height_m: _Size = 0.05
+    tilt_deg: _Size = 3.0
 
 
 class OdometryDrift(PlanModel):
@@ -201,6 +204,14 @@ class Rig(PlanModel):
                          columns, one.footprint_columns))  # fmt: skip
         yaw, x, y, delay, offset, gain, steps, n, footprint = np.array(rows, dtype=np.float64).T.copy()
         return RigNumbers(yaw, x, y, delay, offset, gain, steps, n.astype(np.int64), footprint)
+
+    def row_steps_rad(self) -> _Float:
+        """Return the angle between neighbouring rows of each sensor, (S,), in the proportion of its preset."""
+        steps = []
+        for one, across in zip(self.sensor, np.abs(self.numbers().step_rad), strict=True):
+            base = sensor_of(one.preset, {})
+            steps.append(across * float(base.half_angle_v_deg) * base.cols / (float(base.half_angle_h_deg) * base.rows))
+        return np.array(steps)
 
     def with_numbers(self, numbers: RigNumbers, std: Mapping[str, _Float]) -> Self:
         """Return the rig with calibrated numbers and their standard deviations.

@@ -13,7 +13,7 @@ from phasemark.matcher.estimate.solver import descend
 from phasemark.matcher.locate.kernel_arguments import Outline, Prediction, RigNumbers, Scan
 from phasemark.matcher.locate.plane import difference
 from phasemark.matcher.locate.rig import Rig
-from phasemark.matcher.locate.scan_rows import N_BODY, SENSOR_YAW, empty_prediction, predict, sums
+from phasemark.matcher.locate.scan_rows import N_BODY, N_ROWS, SENSOR_YAW, empty_prediction, predict, sums
 
 _Float = NDArray[np.float64]
 
@@ -40,15 +40,17 @@ class StopModel:
     rig: Rig
     outline: Outline
     numbers: RigNumbers
+    rows = 1
+    """Rows of each sensor in the scans that it explains."""
 
     @property
     def longest(self) -> _Float:
-        """Longest steps of the unknowns of a stop, (6 + 2 S,): of the pose, and some standard deviations of others."""
+        """Longest steps of the unknowns of a stop, (p,): of the pose, and some standard deviations of others."""
         return np.concatenate([[0.15, 0.15, 0.15], 5 * self.unknowns_std])
 
     @property
     def unknowns_std(self) -> _Float:
-        """Standard deviations of the unknowns of a stop beyond its pose, (3 + 2 S,)."""
+        """Standard deviations of the unknowns of a stop beyond its pose, (p − 3,)."""
         stop, sensors = self.rig.stop, len(self.rig.sensor)
         std = [stop.drift_m_s, stop.drift_m_s, stop.age_s]
         std += [stop.offset_m] * sensors + [math.radians(stop.yaw_deg)] * sensors
@@ -84,8 +86,8 @@ class StopFit:
 
     Parameters
     ----------
-    theta : (6 + 2 S,) float64
-    covariance : (6 + 2 S, 6 + 2 S) float64
+    theta : (p,) float64
+    covariance : (p, p) float64
         Of all unknowns of the stop, from evidence and priors.
     cost : float
         Twice the negative logarithm of the likelihood, priors included, but for a constant of the stop.
@@ -154,8 +156,8 @@ def fit_stop(
     ----------
     model : StopModel
     scan : Scan
-    start : (3,) or (6 + 2 S,) float64
-        Pose, or all unknowns.
+    start : (k,) float64
+        The first unknowns, at least the pose; the others are 0.
     prior : (mean, precision), optional
         (3,) and (3, 3): of the pose.
     widths : tuple of float
@@ -165,7 +167,7 @@ def fit_stop(
     -------
     StopFit
     """
-    n = N_BODY + 2 * len(model.rig.sensor)
+    n = 3 + len(model.unknowns_std)
     theta, mean, precision = np.zeros(n), np.zeros(n), np.zeros((n, n))
     theta[: len(start)] = start
     precision[range(3, n), range(3, n)] = model.unknowns_std**-2.0
@@ -189,6 +191,7 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
     A column at the end of a wall may claim more than it knows, so an answer is judged by these.
     """
     seen, sensors = model.prediction(fit.theta, scan), scan.depth_m.shape[1]
+    first = N_BODY + 2 * sensors  # of what follows the sensors' own unknowns
     sigma = model.sigma_m(seen)
     scale = np.sqrt(model.explained((scan.depth_m - seen.depth_m) / sigma, sigma)) / sigma
     information = np.linalg.inv(fit.covariance)
@@ -198,6 +201,7 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
         rows = np.zeros((np.count_nonzero(used), len(fit.theta)))
         rows[:, :N_BODY] = seen.slope[used, s, c, :N_BODY]
         rows[:, N_BODY + s], rows[:, N_BODY + sensors + s] = 1.0, seen.slope[used, s, c, SENSOR_YAW]
+        rows[:, first:] = seen.slope[used, s, c, N_ROWS:]
         rows *= scale[used, s, c, None]
         reduced.append(information - rows.T @ rows)
     root = np.sqrt(np.diag(information))

@@ -4,7 +4,8 @@ While a stop is scanned the odometry says how the body has moved since the first
 the odometry by its delay. The unknowns of a stop are
 
     θ = (x, y, yaw; drift of the odometry along the body's x and y, m/s; age of all data, s;
-         an offset of the range of each sensor, m; an offset of the yaw of each sensor, rad).
+         an offset of the range of each sensor, m; an offset of the yaw of each sensor, rad;
+         and where zones are seen in space: height above that of the map, m, pitch and roll, rad).
 
 An observed column is one of the model with probability 1 − ε and normal, or uniform over the range:
 
@@ -27,6 +28,8 @@ POSE, DRIFT_X, DRIFT_Y, AGE, SENSOR_YAW, SENSOR_X, SENSOR_Y, SCALE, STEP = 0, 3,
 N_ROWS = 11
 N_BODY = 6
 """Unknowns of a stop before those of its sensors."""
+N_TILT = 3
+"""Unknowns of a stop after those of its sensors, in space; their slopes follow the others."""
 
 
 def empty_prediction(scan: Scan, walls: int = 0) -> Prediction:
@@ -124,9 +127,9 @@ def sums(
     sigma_m : (F, S, C) float64
     outlier_density : float
         ε / ((1 − ε) R), per metre.
-    information : (6 + 2 S, 6 + 2 S) float64
-        Result, without priors.
-    gradient : (6 + 2 S,) float64
+    information : (p, p) float64
+        Result, without priors, of 6 + 2 S unknowns, or 9 + 2 S in space.
+    gradient : (p,) float64
         Result.
 
     Returns
@@ -138,7 +141,9 @@ def sums(
     frames, sensors, columns = scan.depth_m.shape
     information[:] = 0.0
     gradient[:] = 0.0
-    row, place = np.empty(N_BODY + 2), np.arange(N_BODY + 2)
+    tilts = len(gradient) - N_BODY - 2 * sensors
+    row, place = np.empty(N_BODY + 2 + tilts), np.arange(N_BODY + 2 + tilts)
+    place[N_BODY + 2 :] += 2 * sensors - 2
     cost, explained = 0.0, 0
     for f in range(frames):
         for s in range(sensors):
@@ -161,7 +166,9 @@ def sums(
                 for p in range(N_BODY):
                     row[p] = seen.slope[f, s, c, p] / sigma
                 row[N_BODY], row[N_BODY + 1] = 1 / sigma, seen.slope[f, s, c, SENSOR_YAW] / sigma
-                for p in range(N_BODY + 2):
+                for p in range(tilts):
+                    row[N_BODY + 2 + p] = seen.slope[f, s, c, N_ROWS + p] / sigma
+                for p in range(len(row)):
                     gradient[place[p]] += weight * r * row[p]
                     for q in range(p + 1):
                         information[place[p], place[q]] += weight * row[p] * row[q]

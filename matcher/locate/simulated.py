@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from phasemark.data.plans.bank_plan import sensor_of
 from phasemark.matcher.locate.kernel_arguments import Scan
 from phasemark.matcher.locate.plane import relative_pose
-from phasemark.matcher.locate.recording import RigRecording
+from phasemark.matcher.locate.recording import RigRecording, reduced_rows
 from phasemark.matcher.locate.rig import OdometryDrift, Rig
 from phasemark.matcher.locate.scan_fit import StopModel
 from phasemark.matcher.locate.wall_map import WallMap
+from phasemark.matcher.locate.zones_in_space import SpaceModel
 
 _Float = NDArray[np.float64]
 
@@ -33,8 +35,9 @@ def simulated_recording(
     ----------
     wall_map : WallMap
     rig : Rig
-    poses : (n, 3) array_like
-        True x, y (m), yaw (rad) at the first frame of each stop.
+    poses : (n, 3) or (n, 6) array_like
+        True x, y (m), yaw (rad) at the first frame of each stop; with height above the map's zero (m), pitch and roll
+        (rad) the recording has the rows of the presets.
     rng : numpy.random.Generator
     time_s : (F,) array_like
         Times of the frames of a stop.
@@ -47,21 +50,30 @@ def simulated_recording(
     """
     truth, times = np.asarray(poses, np.float64), np.asarray(time_s, np.float64)
     track = np.zeros((len(times), 3)) if moved is None else np.asarray(moved, np.float64)
-    model, noise = StopModel(rig, wall_map.outline(), rig.numbers()), rig.noise
+    parts, noise, rows = (rig, wall_map.outline(), rig.numbers()), rig.noise, 1
+    model = StopModel(*parts)
+    if truth.shape[1] == 6:
+        rows = max(sensor_of(one.preset, {}).rows for one in rig.sensor)
+        model = SpaceModel(*parts, wall_map, rows)
     std, columns = model.unknowns_std, model.numbers.columns
-    shape = (len(times), len(columns), int(columns.max()))
+    shape = (len(times), len(columns), rows * int(columns.max()))
     depth = np.empty((len(truth), *shape))
     for k, pose in enumerate(truth):
-        theta = np.concatenate([pose, std * rng.standard_normal(len(std))])
+        theta = np.concatenate([pose[:3], std * rng.standard_normal(len(std))])
+        if len(pose) == 6:
+            theta[-3:] = pose[3:] - [wall_map.height_m, 0.0, 0.0]
         seen = model.prediction(theta, Scan(times, np.empty(shape), times, track))
         own = seen.depth_m + model.sigma_m(seen) * rng.standard_normal(shape)
         elsewhere = rng.random(shape) < noise.outliers
         own = np.where(elsewhere, rng.uniform(0.0, noise.max_range_m, shape), own)
         depth[k] = np.where((own > 0) & (seen.depth_m < noise.max_range_m), own, np.nan)
-    n = len(truth)
+    n, zones = len(truth), None
+    if truth.shape[1] == 6:
+        zones = depth.reshape(*depth.shape[:3], rows, -1)
+        depth = reduced_rows(zones, rig)
     return RigRecording(
-        depth, np.tile(times, (n, 1)), np.tile(track, (n, 1, 1)), _odometry(truth, rig.odometry, rng),
-        np.arange(n), np.zeros(n, np.int64), "simulated", None, "robot", ("",) * n,
+        depth, np.tile(times, (n, 1)), np.tile(track, (n, 1, 1)), _odometry(truth[:, :3], rig.odometry, rng),
+        np.arange(n), np.zeros(n, np.int64), "simulated", None, "robot", ("",) * n, zones,
     )  # fmt: skip
 
 
@@ -83,7 +95,7 @@ def recording_bytes(recording: RigRecording, rig: Rig) -> bytes:
     arrays: dict[str, Any] = {
         "run": recording.run,
         "sensor": np.array(rig.names),
-        "z_m": recording.depth_m.astype(np.float32),
+        "z_m": (recording.depth_m if recording.zone_m is None else recording.zone_m).astype(np.float32),
         "frame_time_s": recording.time_s,
         "stop": recording.stop,
         recording.robot_key: recording.robot,

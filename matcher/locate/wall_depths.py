@@ -1,10 +1,13 @@
 """Depths that columns of zones see of vertical walls: the footprint of a column integrated over the visible outline.
 
 In the frame of a sensor (u along the boresight, v to the left) a direction is τ = v / u, and the inverse depth of a
-wall is linear in τ: u⁻¹ = A + B τ with A u + B v = 1 on the wall. Between neighbouring ends of walls, sorted by τ, one
-wall is the nearest, for no two pieces cross. The depth of a column is the mean of u over its footprint, a triangle in
-τ. Its slopes are exact: those of the depth inside an interval, and at an end the jump of depth times the motion of the
-end.
+wall is linear in τ: u⁻¹ = q = A + B τ with A u + B v = 1 on the wall. Between neighbouring ends of walls, sorted by τ,
+one wall is the nearest, for no two pieces cross. The depth of a column is the mean of u over its footprint, a triangle
+in τ, weighted with the light that returns from walls of one albedo, cos θ / r² of the incidence θ and the range r:
+
+    L = q³ / ( (1 + τ²)^(3/2) √(A² + B²) ) .
+
+Its slopes are exact: those of ∫ L u and ∫ L inside an interval, and at an end their jump times the motion of the end.
 """
 
 from __future__ import annotations
@@ -53,7 +56,8 @@ def column_depths(
     footprint : (S,) float64
         Base of the triangle, in columns.
     depth_m : (n, C) float64
-        Result: mean distance along the boresight; NaN where no wall is seen, and of columns a sensor does not have.
+        Result: mean distance along the boresight, weighted with light; NaN where no wall is seen, and of columns a
+        sensor does not have.
     slope : (n, C, 4) float64
         Result, in the order of :data:`N_SLOPES`.
     wall_slope : (n, C, w) float64
@@ -69,8 +73,9 @@ def column_depths(
     a, b, owner = np.empty(m), np.empty(m), np.empty(m, np.int64)
     end, end_owner = np.empty((2 * m + 2, 3)), np.empty(2 * m + 2, np.int64)
     centre, width = np.empty(most), np.empty(most)
-    total = np.empty((most, N_SLOPES + 3))
-    weight_slope = np.empty((most, N_SLOPES))
+    total = np.empty((most, 4))  # integrals of L, L u, L u², L u τ
+    depth_slope, light_slope, hits = np.empty((most, 3)), np.empty((most, 3)), np.empty(most)
+    light_of_walls = np.empty((most, len(normal) if with_walls else 0))
     for k in range(len(poses)):
         s = sensor[k]
         first, last = np.inf, -np.inf
@@ -109,7 +114,10 @@ def column_depths(
                 ends += 1
         order = np.argsort(end[:ends, 0])
         total[:] = 0.0
-        weight_slope[:] = 0.0
+        depth_slope[:] = 0.0
+        light_slope[:] = 0.0
+        hits[:] = 0.0
+        light_of_walls[:] = 0.0
         depth_m[k] = np.nan
         slope[k] = 0.0
         spread_m[k] = 0.0
@@ -129,22 +137,26 @@ def column_depths(
                         if inverse > best:
                             nearest, best = j, inverse
             if i and nearest != before:
-                left = 1 / (a[before] + b[before] * here) if before >= 0 else 0.0
-                right = 1 / (a[nearest] + b[nearest] * here) if nearest >= 0 else 0.0
+                left, right, light_left, light_right = 0.0, 0.0, 0.0, 0.0
+                if before >= 0:
+                    light_left, left = _light(a[before], b[before], here)
+                if nearest >= 0:
+                    light_right, right = _light(a[nearest], b[nearest], here)
                 ue, ve = end[order[i], 1], end[order[i], 2]
                 motion = (ve / ue**2, -1 / ue, -(1 + here**2))
                 e = end_owner[order[i]]
                 nu, nv = cos * normal[e, 0] + sin * normal[e, 1], cos * normal[e, 1] - sin * normal[e, 0]
                 wall_motion = (nv * ue - ve * nu) / ue**2
-                gained = (1.0 if before >= 0 else 0.0) - (1.0 if nearest >= 0 else 0.0)
+                jump, gained = light_left * left - light_right * right, light_left - light_right
                 for c in range(n):
                     weight = (1 - abs(here - centre[c]) / width[c]) / width[c]
                     if weight > 0:
                         for p in range(3):
-                            total[c, 1 + p] += weight * (left - right) * motion[p]
-                            weight_slope[c, p] += weight * gained * motion[p]
+                            depth_slope[c, p] += weight * jump * motion[p]
+                            light_slope[c, p] += weight * gained * motion[p]
                         if with_walls:
-                            wall_slope[k, c, e] += weight * (left - right) * wall_motion
+                            wall_slope[k, c, e] += weight * jump * wall_motion
+                            light_of_walls[c, e] += weight * gained * wall_motion
             before = nearest
             if nearest < 0:
                 continue
@@ -160,28 +172,42 @@ def column_depths(
                     for g in range(3):
                         tau = 0.5 * (lo + hi) + 0.5 * (hi - lo) * _NODES[g]
                         weight = _WEIGHTS[g] * (hi - lo) * (1 - abs(tau - centre[c]) / width[c]) / width[c]
-                        z = 1 / (an + bn * tau)
-                        total[c, 0] += weight * z
-                        # u⁻¹ = A + B τ: a move along u or v changes it by A or B times itself
-                        total[c, 1] -= weight * an * z
-                        total[c, 2] -= weight * bn * z
-                        total[c, 3] += weight * z * (tau - bn * z * (1 + tau * tau))
-                        total[c, 4] += weight * z * tau
-                        total[c, 5] += weight * z * z
-                        total[c, 6] += weight
+                        hits[c] += weight
+                        light, z = _light(an, bn, tau)
+                        light *= weight
+                        total[c, 0] += light
+                        total[c, 1] += light * z
+                        total[c, 2] += light * z * z
+                        total[c, 3] += light * z * tau
+                        # a move along u or v multiplies q and √(A² + B²) by 1 + A or 1 + B, a turn adds B − A τ to q
+                        turn = z * (bn - an * tau)
+                        depth_slope[c, 0] += light * z * an
+                        depth_slope[c, 1] += light * z * bn
+                        depth_slope[c, 2] += 2 * light * z * turn
+                        light_slope[c, 0] += 2 * light * an
+                        light_slope[c, 1] += 2 * light * bn
+                        light_slope[c, 2] += 3 * light * turn
                         if with_walls:
-                            wall_slope[k, c, e] += weight * z * away
+                            wall_slope[k, c, e] -= light * z * away
+                            light_of_walls[c, e] -= 2 * light * away
         for c in range(n):
-            hit = total[c, 6]
-            share[k, c] = hit
-            if hit < 1e-6:
+            share[k, c] = hits[c]
+            if hits[c] < 1e-6:
                 continue
-            z = total[c, 0] / hit
+            light = total[c, 0]
+            z = total[c, 1] / light
             depth_m[k, c] = z
-            spread_m[k, c] = np.sqrt(max(0.0, total[c, 5] / hit - z * z))
-            for p in range(2):
-                slope[k, c, p] = (total[c, 1 + p] - z * weight_slope[c, p]) / hit
-            slope[k, c, 2] = (total[c, 3] - z * weight_slope[c, 2]) / hit
+            spread_m[k, c] = np.sqrt(max(0.0, total[c, 2] / light - z * z))
+            for p in range(3):
+                slope[k, c, p] = (depth_slope[c, p] - z * light_slope[c, p]) / light
+            slope[k, c, 3] = slope[k, c, 2] - total[c, 3] / light
             if with_walls:
-                wall_slope[k, c] /= hit
-            slope[k, c, 3] = slope[k, c, 2] - total[c, 4] / hit
+                for e in range(len(normal)):
+                    wall_slope[k, c, e] = (wall_slope[k, c, e] - z * light_of_walls[c, e]) / light
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _light(a, b, tau):  # type: ignore[no-untyped-def]
+    """Return the light from a wall at a direction, and the depth there."""
+    q = a + b * tau
+    return q**3 / ((1 + tau * tau) ** 1.5 * np.sqrt(a * a + b * b)), 1 / q

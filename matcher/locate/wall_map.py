@@ -17,6 +17,8 @@ from phasemark.data.plans.bank_plan import PlanModel, plan_of_table
 from phasemark.inputs.toml_file import read_toml
 from phasemark.landmarks import build_mesh, catalog, read_mesh
 from phasemark.matcher.locate.kernel_arguments import Outline
+from phasemark.matcher.locate.plane import turn_of
+from phasemark.render import Body, Scene
 
 _Float = NDArray[np.float64]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -24,6 +26,11 @@ _Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 _Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _TOUCH_M = 1e-3
 """Walls that meet within this touch and do not cross."""
+_TALLEST_M = 20.0
+"""Of a wall in a scene, above and below the sensors: beyond what they reach, and a renderer works in single precision
+there."""
+_FLOOR_M = 40.0
+"""By how much a floor extends beyond the walls."""
 
 
 class Wall(PlanModel):
@@ -74,6 +81,26 @@ class Wall(PlanModel):
         return _polygon([ends[:2] - along - across, ends[2:] + along - across,
                          ends[2:] + along + across, ends[:2] - along + across])  # fmt: skip
 
+    def body(self, height_m: float) -> Body:
+        """Return it as a body of a scene whose sensors are at a height, open at its top if it is thin."""
+        low = max(self.base_m, height_m - _TALLEST_M)
+        high = max(min(self.base_m + self.height_m, height_m + _TALLEST_M), low + _TOUCH_M)
+        (ax, ay), (bx, by) = self.from_m, self.to_m
+        pose = _placed((ax + bx) / 2, (ay + by) / 2, (low + high) / 2, math.atan2(by - ay, bx - ax))
+        length = math.dist(self.from_m, self.to_m)
+        if self.thickness_m:
+            return Body.box((length + self.thickness_m, self.thickness_m, high - low), pose=pose)
+        upright = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
+        return Body.plane((length, high - low), pose=pose @ upright)
+
+
+def _placed(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> _Float:
+    """Return the rigid transform of a body at a place, with a heading, (4, 4)."""
+    pose = np.eye(4)
+    pose[:2, :2] = turn_of(yaw_rad)[:2, :2]
+    pose[:3, 3] = x_m, y_m, z_m
+    return pose
+
 
 class _Placed(PlanModel):
     """A body at a place of the map: x, y of its origin, the height of its base, and the heading of its x axis."""
@@ -83,11 +110,14 @@ class _Placed(PlanModel):
     z_m: _Number = 0.0
     yaw_deg: _Number = 0.0
 
+    def _pose(self, above_m: float = 0.0) -> _Float:
+        """Return the transform of a point of its own axis, above its base, (4, 4)."""
+        return _placed(self.x_m, self.y_m, self.z_m + above_m, math.radians(self.yaw_deg))
+
     def _placed(self, segments: _Float) -> _Float:
         """Return segments (m, 4) of the body's frame in that of the map."""
-        cos, sin = math.cos(math.radians(self.yaw_deg)), math.sin(math.radians(self.yaw_deg))
-        turned = segments.reshape(-1, 2, 2) @ np.array([[cos, sin], [-sin, cos]])
-        return np.asarray((turned + np.array([self.x_m, self.y_m])).reshape(-1, 4))
+        pose = self._pose()
+        return np.asarray((segments.reshape(-1, 2, 2) @ pose[:2, :2].T + pose[:2, 3]).reshape(-1, 4))
 
 
 class Box(_Placed):
@@ -102,6 +132,10 @@ class Box(_Placed):
         x, y = self.size_m[0] / 2, self.size_m[1] / 2
         return self._placed(_polygon([[-x, -y], [x, -y], [x, y], [-x, y]]))
 
+    def body(self) -> Body:
+        """Return it as a body of a scene."""
+        return Body.box(self.size_m, pose=self._pose(self.size_m[2] / 2))
+
 
 class MeshBody(_Placed):
     """A mesh from a file."""
@@ -113,6 +147,10 @@ class MeshBody(_Placed):
         """Return its section at a height, (m, 4)."""
         return self._placed(_section(read_mesh(self.file, unit=self.unit), height_m - self.z_m))
 
+    def body(self) -> Body:
+        """Return it as a body of a scene."""
+        return Body(read_mesh(self.file, unit=self.unit), pose=self._pose())
+
 
 class LandmarkBody(_Placed):
     """A landmark of the catalogue; the key of a file is ``class``."""
@@ -123,10 +161,18 @@ class LandmarkBody(_Placed):
 
     def outline(self, height_m: float) -> _Float:
         """Return its section at a height above its base, (m, 4)."""
+        mesh = self._mesh()
+        return self._placed(_section(mesh, height_m - self.z_m + float(mesh.bounds[0, 2])))
+
+    def body(self) -> Body:
+        """Return it as a body of a scene."""
+        mesh = self._mesh()
+        return Body(mesh, pose=self._pose(-float(mesh.bounds[0, 2])))
+
+    def _mesh(self) -> Any:
         if self.class_name not in catalog():
             raise UsageError(f"'class' must be one of {', '.join(catalog())}, got {self.class_name!r}")
-        mesh = build_mesh(catalog()[self.class_name])
-        return self._placed(_section(mesh, height_m - self.z_m + float(mesh.bounds[0, 2])))
+        return build_mesh(catalog()[self.class_name])
 
 
 class WallMap(PlanModel):
@@ -140,7 +186,9 @@ class WallMap(PlanModel):
     box, mesh, landmark : sequences of Box, MeshBody, LandmarkBody
         Bodies, taken for prisms of their outline at the height of the sensors.
     height_m : float
-        Height of the sensors above the map's zero.
+        Height of the robot's frame, and of its sensors, above the map's zero.
+    floor_m : float
+        Height of the floor, which zones may see where height, pitch and roll are estimated.
     thickness_m, std_m : float
         Of `walls_m`.
     position_std_m, yaw_std_deg : float
@@ -160,6 +208,7 @@ class WallMap(PlanModel):
     mesh: tuple[MeshBody, ...] = ()
     landmark: tuple[LandmarkBody, ...] = ()
     height_m: _Number = 0.5
+    floor_m: _Number = 0.0
     thickness_m: _Size = 0.0
     std_m: _Size = 0.0
     position_std_m: _Size = 0.0
@@ -198,6 +247,10 @@ class WallMap(PlanModel):
         return (*self.wall, *short)
 
     @property
+    def _placed(self) -> tuple[Box | MeshBody | LandmarkBody, ...]:
+        return (*self.box, *self.mesh, *self.landmark)
+
+    @property
     def part(self) -> _Float:
         """Covariance of the part of the error that the map has, (3, 3): m², rad²."""
         return np.diag(np.square([self.position_std_m, self.position_std_m, math.radians(self.yaw_std_deg)]))
@@ -216,7 +269,7 @@ class WallMap(PlanModel):
             Nothing of the map is as high as the sensors.
         """
         walls = self.walls
-        bodies: tuple[Box | MeshBody | LandmarkBody, ...] = (*self.box, *self.mesh, *self.landmark)
+        bodies = self._placed
         seen = [wall.base_m <= self.height_m <= wall.base_m + wall.height_m for wall in walls]
         groups = [wall.outline() if high else np.empty((0, 4)) for wall, high in zip(walls, seen, strict=True)]
         groups += [body.outline(self.height_m) for body in bodies]
@@ -228,6 +281,13 @@ class WallMap(PlanModel):
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         pieces, of = cut_at_crossings(pieces)
         return Outline(pieces, owner[of], np.array(normals), np.array(stds))
+
+    def scene(self) -> Scene:
+        """Return walls, bodies and the floor as a scene."""
+        bodies = [*(wall.body(self.height_m) for wall in self.walls), *(one.body() for one in self._placed)]
+        low_x, low_y, high_x, high_y = self.outline().bounds_m
+        middle = _placed((low_x + high_x) / 2, (low_y + high_y) / 2, self.floor_m, 0.0)
+        return Scene([*bodies, Body.plane((high_x - low_x + _FLOOR_M, high_y - low_y + _FLOOR_M), pose=middle)])
 
     def with_walls_moved(self, displacement_m: _Float) -> Self:
         """Return the map with each wall displaced along its normal, (walls,) m."""
