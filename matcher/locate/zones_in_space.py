@@ -118,27 +118,28 @@ class SpaceModel(StopModel):
     def prediction(self, theta: _Float, scan: Scan, walls: bool = False) -> Prediction:
         """Return the depths that zones should show; a pose within a body shows none."""
         frames, sensors, zones = scan.depth_m.shape
-        depth, spread = np.full(scan.depth_m.shape, np.nan), np.zeros(scan.depth_m.shape)
-        slope = np.zeros((*scan.depth_m.shape, N_ROWS + N_TILT))
-        of_walls = np.empty((0, sensors, zones, 0))
+        shape = frames, sensors, self.rows, zones // self.rows
+        depth, spread = np.full(shape, np.nan), np.zeros(shape)
+        slope = np.zeros((*shape, N_ROWS + N_TILT))
         poses, motion = self._poses(theta, scan)
-        columns = np.r_[0:N_BODY, N_ROWS : N_ROWS + N_TILT]
-        unknowns = np.r_[0:N_BODY, N_BODY + 2 * sensors : N_BODY + 2 * sensors + N_TILT]
+        place = np.r_[0:N_BODY, N_ROWS : N_ROWS + N_TILT, SENSOR_YAW]
+        common = [*range(N_BODY), *range(N_BODY + 2 * sensors, len(theta))]
         for s, (camera, one) in enumerate(zip(self.cameras, self.rig.sensor, strict=True)):
-            views = np.concatenate([poses[:, None, s], poses[:, None, s] @ _NUDGES], axis=1).reshape(-1, 4, 4)
+            views = np.concatenate([poses[:, s, None], poses[:, s, None] @ _NUDGES], axis=1)
             try:
-                mean, width = camera.zones(views)
+                mean, width = camera.zones(views.reshape(-1, 4, 4))
             except UsageError:  # the lens is inside a body
                 continue
-            own = self.rows * mean.shape[2]
-            mean = mean.reshape(frames, len(_NUDGES) + 1, own)
+            mean, width = (value.reshape(frames, len(_NUDGES) + 1, *value.shape[1:]) for value in (mean, width))
             scale = self.numbers.scale[s] * math.cos(math.radians(one.pitch_deg))  # without what a level wall gains
-            by_motion = np.nan_to_num(np.moveaxis((mean[:, 1:] - mean[:, :1]) / _STEP, 1, 2)) * scale
-            depth[:, s, :own] = scale * mean[:, 0] + self.numbers.offset_m[s] + theta[N_BODY + s]
-            spread[:, s, :own] = width.reshape(mean.shape)[:, 0]
-            slope[:, s, :own, columns] = np.moveaxis(by_motion @ motion[:, s][:, :, unknowns], 2, 0)
-            slope[:, s, :own, SENSOR_YAW] = (by_motion @ motion[:, s, :, N_BODY + sensors + s, None])[..., 0]
-        return Prediction(depth, slope, spread, of_walls)
+            count = mean.shape[3]
+            depth[:, s, :, :count] = scale * mean[:, 0] + self.numbers.offset_m[s] + theta[N_BODY + s]
+            spread[:, s, :, :count] = width[:, 0]
+            by_motion = np.nan_to_num(scale / _STEP * (mean[:, 1:] - mean[:, :1]))
+            by_unknown = motion[:, s][:, :, [*common, N_BODY + sensors + s]]
+            slope[:, s][:, :, :count, place] = np.einsum("fmrc,fmp->frcp", by_motion, by_unknown)
+        flat, no_walls = scan.depth_m.shape, np.empty((0, sensors, zones, 0))
+        return Prediction(depth.reshape(flat), slope.reshape(*flat, -1), spread.reshape(flat), no_walls)
 
     def _poses(self, theta: _Float, scan: Scan) -> tuple[_Float, _Float]:
         """Return camera2world, (F, S, 4, 4), and each camera's six motions by each unknown, (F, S, 6, p)."""
