@@ -17,7 +17,7 @@ from phasemark.matcher.locate.plane import difference, relative_pose
 from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
-from phasemark.matcher.locate.scan_fit import StopFit, StopModel, fit_stop, std_without_one
+from phasemark.matcher.locate.scan_fit import StopFit, StopModel, along_profiles, fit_stop, std_without_one
 from phasemark.matcher.locate.wall_map import WallMap
 from phasemark.matcher.locate.zones_in_space import SpaceModel
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
@@ -316,12 +316,15 @@ class Locator:
         observed = int(np.isfinite(scan.depth_m).sum())
         if not observed:
             return LocatedPose(("", 0, 0))
-        fits = self._fits(scan, prior)
+        model, given, fits = self.model, _given(prior), self._fits(scan, prior)
         if zones is not None:
-            fits = self._distinct([fit_stop(*zones, fit.theta, _given(prior), (2.0, 1.0)) for fit in fits])
+            model, scan = zones
+            fits = self._distinct([fit_stop(model, scan, fit.theta, given, (2.0, 1.0)) for fit in fits])
         if not fits:
             return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
-        return self._answer(*(zones or (self.model, scan)), fits, prior)
+        if zones is None:
+            fits[0] = along_profiles(model, scan, fits[0], given)
+        return self._answer(model, scan, fits, prior)
 
     def _fits(self, scan: Scan, prior: tuple[_Float, _Float] | None) -> list[StopFit]:
         """Return distinct fits, best first: descents on three frames from a grid, then on all frames."""

@@ -167,12 +167,9 @@ def fit_stop(
     -------
     StopFit
     """
-    n = 3 + len(model.unknowns_std)
-    theta, mean, precision = np.zeros(n), np.zeros(n), np.zeros((n, n))
+    mean, precision = _priors(model, prior)
+    theta = np.zeros(len(mean))
     theta[: len(start)] = start
-    precision[range(3, n), range(3, n)] = model.unknowns_std**-2.0
-    if prior is not None:
-        mean[:3], precision[:3, :3] = prior
     longest = model.longest
     for k in range(_MOST_ROUNDS):
         width = widths[min(k, len(widths) - 1)]
@@ -210,13 +207,51 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
     return np.asarray(np.sqrt(np.abs(np.einsum("kpp->kp", covariance)[:, :3]).max(axis=0)) / root[:3])
 
 
-def _as_fit(point: _Point, with_prior: bool) -> StopFit:
-    """Return the fit at a place; its cost counts the width of the noise there, which differs from place to place."""
-    observed = np.isfinite(point.scan.depth_m)
+def along_profiles(model: StopModel, scan: Scan, fit: StopFit, prior: tuple[_Float, _Float] | None) -> StopFit:
+    """Return a fit whose pose is as uncertain as the likelihood is: where walls end in columns, slopes do not hold.
+
+    Along each principal axis of the pose's covariance the variance is that of the likelihood's profile if that is
+    larger; the other unknowns follow linearly. Parameters as for :func:`fit_stop`.
+    """
+    own = fit.covariance[:3, :3]
+    if not np.isfinite(own).all():
+        return fit
+    at = np.linspace(-3.0, 3.0, 13)  # standard deviations
+    root = np.sqrt(np.diag(own))
+    values, axes = np.linalg.eigh(own / np.outer(root, root))
+    axes = root[:, None] * axes * np.sqrt(values)
+    ways = fit.covariance[:, :3] @ np.linalg.solve(own, axes)
+    around, variance = _priors(model, prior), np.ones(3)
+    for k, way in enumerate(ways.T):
+        cost = np.array([_cost(_Point(model, scan, fit.theta + by * way, around)) for by in at])
+        weight = np.exp(-0.5 * (cost - cost.min()))
+        mean = np.average(at, weights=weight)
+        variance[k] = max(1.0, np.average((at - mean) ** 2, weights=weight))
+    covariance = fit.covariance.copy()
+    covariance[:3, :3] = axes * variance @ axes.T
+    return replace(fit, covariance=covariance)
+
+
+def _cost(point: _Point) -> float:
+    """Return the cost at a place with the width of the noise there, which differs from place to place."""
     assert point.sigma_m is not None
-    width = point.sigma_m[observed]
+    width = point.sigma_m[np.isfinite(point.scan.depth_m)]
     kappa = point.model.outlier_density * width * math.sqrt(2 * math.pi)
-    cost = point.cost + 2 * float(np.log(width / (1 + kappa)).sum())
+    return point.cost + 2 * float(np.log(width / (1 + kappa)).sum())
+
+
+def _priors(model: StopModel, prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float]:
+    """Return the mean and the precision that all unknowns of a stop have beforehand."""
+    n = 3 + len(model.unknowns_std)
+    mean, precision = np.zeros(n), np.zeros((n, n))
+    precision[range(3, n), range(3, n)] = model.unknowns_std**-2.0
+    if prior is not None:
+        mean[:3], precision[:3, :3] = prior
+    return mean, precision
+
+
+def _as_fit(point: _Point, with_prior: bool) -> StopFit:
+    """Return the fit at a place."""
     information = point.information
     root = np.sqrt(np.maximum(np.diag(information), 1e-300))
     covariance = np.linalg.pinv(information / np.outer(root, root), hermitian=True) / np.outer(root, root)
@@ -224,4 +259,5 @@ def _as_fit(point: _Point, with_prior: bool) -> StopFit:
         covariance[:3, :3] = np.inf
     theta = point.theta.copy()
     theta[2] = math.remainder(theta[2], math.tau)
-    return StopFit(theta, covariance, cost, point.explained, int(observed.sum()))
+    observed = int(np.isfinite(point.scan.depth_m).sum())
+    return StopFit(theta, covariance, _cost(point), point.explained, observed)
