@@ -20,7 +20,7 @@ from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank.build_bank import rebuild_bank
 from phasemark.data.measured.orientation import Orientation
-from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, fitted_wall, wider
+from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, wider
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.frequencies import OneFrequencyBank
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
@@ -444,9 +444,9 @@ class _Trials:
             if scene is not None and scene.wall_m is not None:
                 if rough is None:  # wide pixels average over the wall, and a bearing turns it
                     first = self.search.best(self.frame, scene, bearing=True)
-                    scene = scene if first is None else fitted_wall(self.frame, scene, first.bearing_rad)
+                    scene = scene if first is None else self.search.with_fitted_background(self.frame, scene, first)
                     rough = self._rough(self.frame, scene)
-                scene = scene if rough is None else fitted_wall(self.frame, scene, rough.bearing_rad)
+                scene = scene if rough is None else self.search.with_fitted_background(self.frame, scene, rough)
             if rough is None:
                 continue
             stated: list[_Behind] = [background]

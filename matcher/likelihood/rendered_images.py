@@ -89,6 +89,13 @@ class RenderedModel(ImageModel):
         other._stand_before(backgrounds)
         return other
 
+    def seen_by(self, sensor: Sensor) -> RenderedModel:
+        """Return the same landmarks seen by another camera, at any distance."""
+        other = copy.copy(self)
+        other.sensor, other.cache, other._bank_end_m = sensor, ViewCache(0), math.inf
+        other._renderers = [one.seen_by(sensor) for one in self._renderers]
+        return other
+
     def of_frames(self, frame: NDArray[np.int64]) -> RenderedModel:
         """Return the model whose views are those of some frames."""
         if len(self._backgrounds) == 1:

@@ -105,6 +105,12 @@ class Evidence:
         """Return the same ranges as those of a noisier camera, whose variance is larger by that of `std_m`."""
         return replace(self, weight=self.weight / (1 + self.weight * std_m**2))
 
+    def of_pixels(self, some: NDArray[np.bool_]) -> Evidence:
+        """Return the frames with some pixels (pixels,) alone; the others are missing."""
+        seen = self.seen
+        there = Observation(seen.range_m, seen.weight * some, seen.returned & some, seen.not_returned & some)
+        return replace(self, weight=self.weight * some, seen=there)
+
     @property
     def per_pixel(self) -> int:
         """Residuals that a pixel leaves."""
