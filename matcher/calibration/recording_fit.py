@@ -251,9 +251,9 @@ class RecordingFit:
         return np.concatenate(residuals) - place.zone, np.concatenate(candidates)
 
     def slopes(self, place: Place) -> tuple[_Float, _Float]:
-        """Return slopes of the ranges by parameters, (K, p + R q, pixels), and by pose errors, (K, s, pixels).
+        """Return slopes of the ranges by parameters, (K, P, pixels), and by pose errors, (K, s, pixels).
 
-        The parameters are the free ones, in natural units, and what each recording has of its own.
+        The parameters are the free ones, in natural units, what each recording has of its own, and offsets of zones.
         """
         found = []
         names = tuple(dict.fromkeys((*self.free, *(name for name in self.own if name not in (TURN, "delay")))))
@@ -271,6 +271,9 @@ class RecordingFit:
             for r in range(len(self.recorded))
             for one in by_own
         ]
+        if self.zones:  # slopes by the offset of a zone are 1 there and 0 elsewhere
+            pixels = by_free.shape[2]
+            parts.append(np.broadcast_to(_ZONE_UNIT_M * np.eye(pixels), (len(by_free), pixels, pixels)))
         return np.concatenate([by_free * self.scale[:, None], *parts], axis=1), by_pose
 
     def delay_s(self, place: Place) -> float:
@@ -282,29 +285,8 @@ class RecordingFit:
 
     def linear(self, slopes: tuple[_Float, _Float], residual: _Float, use: _Bool, std: _Float) -> RandomEffects:
         """Return Gram matrices of the parameters (in natural units) and the pose errors (in their units)."""
-        weight = np.where(use, 1 / std**2, 0.0)
-        r = np.where(use, residual, 0.0)
-        j = np.where(use[:, None], slopes[0], 0.0)
-        s = np.where(use[:, None], slopes[1], 0.0) * self.unit[:, None]
-        wj, ws = weight[:, None] * j, weight[:, None] * s
-        js, jr = j @ ws.transpose(0, 2, 1), np.einsum("kpr,kr->kp", wj, r)
-        jj = np.add.reduceat(j @ wj.transpose(0, 2, 1), self.start, axis=0)
-        if self.zones:  # slopes by the offset of a zone are 1 there and 0 elsewhere
-            js = np.concatenate([js, _ZONE_UNIT_M * ws.transpose(0, 2, 1)], axis=1)
-            jr = np.concatenate([jr, _ZONE_UNIT_M * weight * r], axis=1)
-            cross = _ZONE_UNIT_M * np.add.reduceat(wj, self.start, axis=0)
-            own = _ZONE_UNIT_M**2 * np.add.reduceat(weight, self.start, axis=0)
-            square = own[:, :, None] * np.eye(own.shape[1])
-            jj = np.block([[jj, cross], [cross.transpose(0, 2, 1), square]])
-        return RandomEffects(
-            jj,
-            np.add.reduceat(jr, self.start, axis=0),
-            js,
-            s @ ws.transpose(0, 2, 1),
-            np.einsum("ksr,kr->ks", ws, r),
-            float((weight * r**2).sum()),
-            self.start,
-        )
+        j, s, r = (np.where(use[:, None], one / std[:, None], 0.0) for one in (*slopes, residual[:, None]))
+        return RandomEffects.of_frames(j, s * self.unit[:, None], r[:, 0], self.start)
 
     def prior_of(self, place: Place, sizes: Sizes) -> tuple[_Float, _Float]:
         """Return the prior's precision and how far its mean is from a place, (P,) each, in natural units."""
@@ -592,11 +574,7 @@ class RecordingFit:
         after = np.full(residual.shape, np.nan)
         for k in range(min(FOLDS, len(self.start))):
             step, _ = self.step(linear, place, sizes, fold != k)
-            of_slopes, of_zones = np.split(step, [slope.shape[1]])
-            change = np.einsum("kpr,p->kr", slope, of_slopes)
-            if self.zones:
-                change = change + _ZONE_UNIT_M * of_zones
-            after[of_frame == k] = (residual - change)[of_frame == k]
+            after[of_frame == k] = (residual - np.einsum("kpr,p->kr", slope, step))[of_frame == k]
         return after
 
     def _sensor_fields(

@@ -60,11 +60,12 @@ class RandomEffects:
     start: NDArray[np.int64]
 
     @classmethod
-    def of_frames(cls, j: _Float, s: _Float, r: _Float) -> RandomEffects:
-        """Take whitened slopes (K, P, R) and (K, E, R) and residuals (K, R) of frames that share no block."""
-        st = s.transpose(0, 2, 1)
-        jj, jr, sr = j @ j.transpose(0, 2, 1), np.einsum("kpr,kr->kp", j, r), np.einsum("ker,kr->ke", s, r)
-        return cls(jj, jr, j @ st, s @ st, sr, float((r**2).sum()), np.arange(len(r)))
+    def of_frames(cls, j: _Float, s: _Float, r: _Float, start: NDArray[np.int64] | None = None) -> RandomEffects:
+        """Take whitened slopes (K, P, R) and (K, E, R) and residuals (K, R); without `start` frames share no block."""
+        first, st = np.arange(len(r)) if start is None else start, s.transpose(0, 2, 1)
+        jj, jr = j @ j.transpose(0, 2, 1), np.einsum("kpr,kr->kp", j, r)
+        jj, jr = (np.add.reduceat(each, first, axis=0) for each in (jj, jr))
+        return cls(jj, jr, j @ st, s @ st, np.einsum("ker,kr->ke", s, r), float((r**2).sum()), first)
 
     def marginal(self, frame: _Float, block: _Float | None = None, keep: NDArray[np.bool_] | None = None) -> Marginal:
         """Eliminate the errors of frames and blocks.
