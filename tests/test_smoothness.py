@@ -104,31 +104,23 @@ def assert_smooth(scene, views, **background):
         assert residual.max() < ROUGHEST, parameter
 
 
+@pytest.mark.parametrize(
+    ("seed", "n", "background"),
+    [
+        (11, 12, None),
+        *(pytest.param(77, 200, one, marks=pytest.mark.soak) for one in (None, Background(wall_m=4.0, floor_m=0.21))),
+    ],
+)
 @pytest.mark.parametrize("name", list(catalog()))
-def test_phasors_stay_on_a_quadratic_where_no_edge_or_vertex_passes_a_border(scenes, name):
-    assert_smooth(scenes[name], random_views(np.random.default_rng(11), 12))
+def test_phasors_stay_on_a_quadratic_where_no_edge_or_vertex_passes_a_border(scenes, name, seed, n, background):
+    assert_smooth(scenes[name], random_views(np.random.default_rng(seed), n), background=background)
 
 
+# of 95 % that have to agree, 16 or more of 20 do with a probability of 99.7 %; of 400, less two standard deviations
+@pytest.mark.parametrize(("seed", "n", "share"), [(12, 20, 0.8), pytest.param(78, 400, 0.93, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("name", list(catalog()))
-def test_difference_quotients_of_two_steps_agree(scenes, name):
-    # 20 views: of 95 % that have to agree, 16 or more do with a probability of 99.7 %
-    views = random_views(np.random.default_rng(12), 20)
+def test_difference_quotients_of_two_steps_agree(scenes, name, seed, n, share):
+    views = random_views(np.random.default_rng(seed), n)
     for parameter in PARAMETERS:
         difference = difference_quotients(scenes[name][0], views, parameter)
-        assert np.mean(difference <= 0.01) >= 0.8, parameter
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("background", [None, Background(wall_m=4.0, floor_m=0.21)], ids=["bare", "wall and floor"])
-@pytest.mark.parametrize("name", list(catalog()))
-def test_phasors_stay_on_a_quadratic_in_two_hundred_views(scenes, name, background):
-    assert_smooth(scenes[name], random_views(np.random.default_rng(77), 200), background=background)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("name", list(catalog()))
-def test_difference_quotients_agree_in_95_percent_of_four_hundred_views(scenes, name):
-    views = random_views(np.random.default_rng(78), 400)
-    for parameter in PARAMETERS:
-        difference = difference_quotients(scenes[name][0], views, parameter)
-        assert np.mean(difference <= 0.01) >= 0.93, parameter  # 95 % less two standard deviations
+        assert np.mean(difference <= 0.01) >= share, parameter
