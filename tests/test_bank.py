@@ -3,7 +3,6 @@
 import hashlib
 import json
 import os
-import resource
 import shutil
 
 import h5py
@@ -12,7 +11,7 @@ import pytest
 import trimesh
 import xarray
 
-from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
+from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.data.files import mesh_sha256, versions
 from phasemark.data.files.hdf5_layout import Layout, SparseMemory
@@ -23,7 +22,6 @@ from phasemark.render import PhasorImages, Renderer, preset
 GRID = {"distance_m": "0.8:1.2:0.2", "delta_deg": "0:180:45"}  # 3 distances, 4 angles
 PLAN = BankPlan(classes=["cone", "post"], **GRID)
 FULL = BankPlan(classes=["cone", "post"], layout="full", **GRID)
-FILE_LIMIT_BYTES = 1 << 17  # below the size of either bank, above anything else a test writes
 
 
 class Painter:
@@ -308,34 +306,6 @@ def test_an_existing_bank_needs_force_and_is_asked_about_before_rendering(bank_f
     build_bank(FULL, bank_file, force=True).close()
     assert bank_file.read_bytes() != before
     verify_checksum(bank_file)
-
-
-def test_an_interrupted_build_leaves_the_old_bank_and_can_be_resumed(bank_file, tmp_path):
-    before = bank_file.read_bytes()
-
-    def interrupt(done, total):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        build_bank(FULL, bank_file, force=True, shard_items=5, progress=interrupt)
-    assert bank_file.read_bytes() == before
-    verify_checksum(bank_file)
-    assert names(bank_file.parent) == ["bank.h5", "bank.h5.manifest", "bank.h5.partial", "bank.h5.sha256"]
-    build_bank(FULL, bank_file, force=True, resume=True).close()
-    build_bank(FULL, tmp_path / "again.h5").close()
-    assert bank_file.read_bytes() == (tmp_path / "again.h5").read_bytes()
-    assert names(bank_file.parent) == ["again.h5", "again.h5.sha256", "bank.h5", "bank.h5.sha256"]
-
-
-def test_a_file_size_limit_of_the_system_is_an_error_not_a_crash(tmp_path, painted):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (FILE_LIMIT_BYTES, hard))
-    try:
-        with pytest.raises(StorageError, match="File too large"):
-            build_bank(FULL, tmp_path / "bank.h5")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert names(tmp_path) == []
 
 
 @pytest.mark.parametrize(

@@ -424,6 +424,7 @@ def test_a_full_disk_exits_with_5_and_leaves_nothing(run, tmp_path, monkeypatch,
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert (code, out) == (5, "")
     assert len(err.splitlines()) == 1
+    assert "File too large" in err
     assert list(tmp_path.iterdir()) == []
 
 

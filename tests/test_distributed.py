@@ -10,7 +10,6 @@ from builders import run_program
 from phasemark import OutputExistsError, UsageError
 from phasemark.data import FramePlan, build_frames
 from phasemark.data.frames.build_frames import FrameJob
-from phasemark.data.shards.build import build
 from phasemark.data.shards.remote import make_bytes
 
 PLAN = FramePlan(classes=["cone", "post"], views=40, frames_per_view=2, seed=7, wall_m=4.0)
@@ -40,27 +39,6 @@ def test_a_dask_cluster_whose_workers_are_killed_every_2_s_makes_the_same_bytes(
     killed = dask_build(tmp_path / "frames.h5", views, 2)
     assert killed >= 3
     assert (tmp_path / "frames.h5").read_bytes() == (tmp_path / "reference.h5").read_bytes()
-
-
-def test_every_shard_made_twice_gives_the_same_bytes(reference, tmp_path):
-    class Twice:
-        def __init__(self, job):
-            self.job = job
-
-        def make(self, start, stop):
-            first, second = self.job.make(0, start, stop), self.job.make(0, start, stop)
-            assert all(a.tobytes() == b.tobytes() for a, b in zip(first, second, strict=True))
-            return second
-
-        def concurrency(self):
-            return 3
-
-        def close(self):
-            pass
-
-    job = FrameJob(PLAN)
-    build(job, tmp_path / "frames.h5", maker=Twice(job), shard_items=7)
-    assert (tmp_path / "frames.h5").read_bytes() == reference
 
 
 def test_a_worker_that_would_make_other_bytes_is_refused():

@@ -15,17 +15,15 @@ import trimesh
 import xarray
 from own_generators import WALL, at
 
-from phasemark import InputFileError, OutputExistsError, UsageError
+from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.data import build_frames, open_frames
 from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
 from phasemark.data.frames import FrameSet
-from phasemark.data.frames.scene_frames_job import SceneFramesJob
 from phasemark.data.partial_outputs import build_part, estimate_build, merge_parts
 from phasemark.data.plans import SceneFramesPlan, planned_size
 from phasemark.data.seeds import stream
-from phasemark.data.shards.build import manifest_path, partial_path
 from phasemark.data.verify import verify_frames
 from phasemark.matcher.plan_kinds import check_plan, plan_example
 from phasemark.render import Flag, Scene, SceneRenderer, capture, preset
@@ -77,34 +75,6 @@ def test_parts_are_merged_without_their_generator(tmp_path: Path, monkeypatch: p
     part = build_part(plan_of("one_wall"), (1, 1), tmp_path / "part.h5", workers=1)
     monkeypatch.setattr("phasemark.data.plans.scene_frames_plan.imported_generator", lambda name: 1 / 0)
     assert merge_parts([part], tmp_path / "merged.h5").exists()
-
-
-def test_a_run_that_ended_early_is_continued_to_the_same_bytes(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[int] = []
-    ends = [6]
-    make = SceneFramesJob.make
-
-    def until_the_sixth(self: SceneFramesJob, slab: int, start: int, stop: int) -> list[Any]:
-        made.append(start)
-        if start in ends:
-            ends.remove(start)
-            raise KeyboardInterrupt
-        return make(self, slab, start, stop)
-
-    monkeypatch.setattr(SceneFramesJob, "make", until_the_sixth)
-    out = tmp_path / "scenes.h5"
-    with pytest.raises(KeyboardInterrupt):
-        build_frames(ROOM, out, workers=1, shard_items=1)
-    assert partial_path(out).exists()
-    assert manifest_path(out).exists()
-    made.clear()
-    with pytest.raises(OutputExistsError, match=r"seed: 3 → 4"):
-        build_frames(ROOM.model_copy(update={"seed": 4}), out, workers=1, resume=True)
-    build_frames(ROOM, out, workers=1, resume=True).close()
-    assert made[0] == 6  # what was finished is not made again
-    assert out.read_bytes() == path.read_bytes()
 
 
 def test_verify_makes_scenes_again_if_the_generator_is_named(path: Path) -> None:

@@ -18,19 +18,14 @@ def reference(tmp_path_factory):
     return tables(folder)
 
 
-def test_two_threads_give_the_tables_of_one_worker(reference, tmp_path):
-    run_sweep(plan(TRIALS), tmp_path, workers=2)
-    assert tables(tmp_path) == reference
-
-
 @pytest.fixture(scope="module")
 def ways(tmp_path_factory):
-    """A folder in which the program was run, killed twice, and what it printed."""
+    """A folder in which the program was run by two threads, killed twice, and what it printed."""
     folder = tmp_path_factory.mktemp("program")
     return folder, run_program("sweep_random_kills", folder, TRIALS, 2, 17)
 
 
-def test_a_sweep_killed_at_a_random_moment_and_resumed_gives_the_tables_of_one_that_was_not(ways, reference):
+def test_two_threads_and_a_sweep_that_is_killed_and_resumed_give_the_tables_of_one_worker(ways, reference):
     folder, counts = ways  # the program compares the killed ones with its first
     assert sum(map(int, counts.split())) == 2
     assert tables(folder / "warm") == reference
