@@ -1,6 +1,7 @@
 """Messages of the library name parameters; the command line, and it alone, turns them into flags."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -19,8 +20,10 @@ COMMAND = re.compile(r"(phasemark|frames export) [^'\"]*")
 """A whole command, with which a file that states it was made, may have flags."""
 
 
+@functools.cache
 def texts(path):
-    """Yield the strings of a module that are no docstrings, values within them left out, with their lines."""
+    """Return the strings of a module that are no docstrings, values within them left out, with their lines."""
+    found = []
     tree = ast.parse(path.read_text(encoding="utf-8"))
     skipped = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
     skipped |= {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
@@ -28,9 +31,11 @@ def texts(path):
         if id(node) in skipped:
             continue
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node.lineno, node.value
+            found.append((node.lineno, node.value))
         elif isinstance(node, ast.JoinedStr):
-            yield node.lineno, "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values)
+            text = "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values)
+            found.append((node.lineno, text))
+    return found
 
 
 def with_flags(path):
