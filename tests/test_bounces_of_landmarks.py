@@ -60,8 +60,9 @@ def mesh(known: dict[str, Any]) -> trimesh.Trimesh:
 
 
 @pytest.fixture(scope="module")
-def renderer(mesh: trimesh.Trimesh, sensor: Sensor) -> Renderer:
-    return Renderer(mesh, sensor, albedo=0.8)
+def renderer(bank: Bank) -> Renderer:
+    """Return a renderer that shares its light with those of the bank's matchers."""
+    return Renderer(bank.mesh("box"), bank.sensor, albedo=0.8)
 
 
 @pytest.mark.parametrize(("bounces", "key", "largest"), [(1, "bounces_1", 2e-3), ("all", "all", 3e-3)])
@@ -77,17 +78,17 @@ def test_a_box_before_floor_and_wall_returns_the_light_of_a_foreign_path_tracer(
     assert (images[1].intensity >= images[0].intensity - 1e-9).all()
 
 
-def test_light_between_nodes_is_that_of_nodes_nearby(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_light_between_nodes_is_that_of_a_node_there(renderer: Renderer, monkeypatch: pytest.MonkeyPatch) -> None:
     behind, view = replace(BEHIND, bounces="all"), (1.04, 0.07)
     direct = np.abs(renderer.render(*view, background=BEHIND).phasor)
     coarse = renderer.render(*view, background=behind).phasor
     assert renderer._standing is not None
-    monkeypatch.setattr(standing, "_STEP_SHARE", 0.01)
-    monkeypatch.setattr(standing, "_STEP_RAD", 2 * np.pi / 500)
-    renderer._standing._nodes.clear()
-    fine = renderer.render(*view, background=behind).phasor
-    renderer._standing._nodes.clear()
-    assert np.abs(coarse - fine).max() < 1e-3 * direct.max()
+    monkeypatch.setattr(standing, "_STEP_SHARE", np.log(view[0]))  # the view is a node itself
+    monkeypatch.setattr(standing, "_STEP_RAD", view[1])
+    monkeypatch.setattr(renderer._standing, "_nodes", {})
+    exact = renderer.render(*view, background=behind).phasor
+    assert len(renderer._standing._nodes) == 1
+    assert np.abs(coarse - exact).max() < 1e-3 * direct.max()
     assert np.abs(coarse).max() > 1.01 * direct.max()
 
 
@@ -222,10 +223,10 @@ def test_a_box_before_a_wall_alone_returns_the_light_of_the_same_scene() -> None
 
 
 def test_renderers_of_a_landmark_share_its_patches_and_those_of_an_albedo_the_light(
-    mesh: trimesh.Trimesh, sensor: Sensor, renderer: Renderer
+    bank: Bank, renderer: Renderer
 ) -> None:
-    behind = replace(BEHIND, bounces=1)
-    first, again = renderer.render(1.0, background=behind), Renderer(mesh.copy(), sensor, albedo=renderer.albedo)
+    behind, sensor, mesh = replace(BEHIND, bounces=1), bank.sensor, bank.mesh("box")
+    first, again = renderer.render(1.0, background=behind), Renderer(mesh, sensor, albedo=renderer.albedo)
     np.testing.assert_array_equal(again.render(1.0, background=behind).phasor, first.phasor)
     darker = Renderer(mesh, sensor, albedo=0.5 * renderer.albedo)
     darker.render(1.0, background=behind)

@@ -244,7 +244,8 @@ def test_conditions_that_cannot_be_seen_are_named_before_a_folder_is_made(tmp_pa
 
 
 def test_light_that_bounces_is_in_the_world_and_in_a_method_that_knows_it(tmp_path):
-    known = {"name": "small", "classes": ["cone"], "trials": 10, "bank_distance_m": (0.95, 1.05), "spread": (0.01, 1)}
+    box = {"name": "box", "box": {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}}  # few patches exchange light
+    known = {"name": "small", "landmarks": [box], "trials": 10, "bank_distance_m": (0.95, 1.05), "spread": (0.01, 1)}
     behind = {"wall_m": [2.0], "floor_m": [0.15], "bounces": [0, 2]}
     methods = [Method(name="direct"), Method(name="bounces", knows="bounces"), Method(name="none", knows="nothing")]
     trials = run_sweep(
