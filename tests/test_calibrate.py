@@ -559,6 +559,16 @@ TURNING = Mounting(0.5 * DEGREE, -0.7 * DEGREE, 0.0, DEGREE, 22.8 * DEGREE, 22.5
 TOF_NOISE = {"range_std_m": 2e-3, "range_ambient_std_m": 4e-3}
 
 
+def carelessly_mounted(rng, tilt_deg, field, offset_m, delay_s=0.0, bearing_deg=None):
+    """Return a mounting whose numbers are off by these standard deviations, and whose delay by at most `delay_s`."""
+    bearing_deg = tilt_deg if bearing_deg is None else bearing_deg
+    return Mounting(
+        *(tilt_deg * DEGREE * rng.standard_normal(2)), 0.0, bearing_deg * DEGREE * rng.standard_normal(),
+        22.5 * DEGREE * (1 + field * rng.standard_normal()), 22.5 * DEGREE, offset_m * rng.standard_normal(), 0.8,
+        rng.uniform(-delay_s, delay_s) if delay_s else 0.0,
+    )  # fmt: skip
+
+
 def ride(time_s, phase):
     """Return where a camera is that approaches a board and turns before it, at up to 42° and 0.22 m a second."""
     return KnownPoses.polar(
@@ -597,11 +607,7 @@ def record(rng, mounting, n=40, *, zone=None, turn=0.0, tilt=0.0):
 def moved(seed, n=40, *, tilt=0.0, told=lambda poses: poses):
     """Calibrate a camera with everything wrong at once; return its NEES, what was found and what is true."""
     rng = np.random.default_rng([2027, seed])
-    truth = Mounting(
-        *(2 * DEGREE * rng.standard_normal(2)), 0.0, 2 * DEGREE * rng.standard_normal(),
-        22.5 * DEGREE * (1 + 0.02 * rng.standard_normal()), 22.5 * DEGREE, 0.02 * rng.standard_normal(), 0.8,
-        rng.uniform(-0.15, 0.15),
-    )  # fmt: skip
+    truth = carelessly_mounted(rng, 2.0, 0.02, 0.02, 0.15)
     frames, poses, zone = record(rng, truth, n, tilt=tilt)
     found = calibrate(BOARD, frames, told(poses), free=FREE, moving=True)
     return nees(found, truth), found, truth, zone
@@ -634,11 +640,7 @@ def test_frames_whose_noise_varies_are_refused_as_often_as_others():
 def part_of_zones(seed, n):
     """Return frames of a chip that rides before a cone and a wall, the poses, and the mounting."""
     rng = np.random.default_rng([2028, seed])
-    truth = Mounting(
-        *(1.5 * DEGREE * rng.standard_normal(2)), 0.0, 1.5 * DEGREE * rng.standard_normal(),
-        22.5 * DEGREE * (1 + 0.01 * rng.standard_normal()), 22.5 * DEGREE, 0.02 * rng.standard_normal(), 0.8,
-        rng.uniform(-0.1, 0.1),
-    )  # fmt: skip
+    truth = carelessly_mounted(rng, 1.5, 0.01, 0.02, 0.1)
     stamps, phase = 10 + np.arange(n) / 15, rng.uniform(0, 6)
 
     def ride_past(time):
@@ -883,20 +885,15 @@ APART = np.array([0.8 * DEGREE, 0.8 * DEGREE, 0.0, 0.8 * DEGREE, 0.0, 0.0, 5e-3,
 def several(seed, turns=(3.0, 0.4, -0.3)):
     """Calibrate on three recordings; return what was found, the mounting, and that of a fourth recording."""
     rng = np.random.default_rng([77, seed])
-    base = np.array(
-        [
-            *(2 * DEGREE * rng.standard_normal(2)), 0.0, 2 * DEGREE * rng.standard_normal(),
-            22.5 * DEGREE * (1 + 0.02 * rng.standard_normal()), 22.5 * DEGREE, 0.02 * rng.standard_normal(), 0.8, 0.0,
-        ]
-    )  # fmt: skip
-    each = [Mounting(*(base + APART * rng.standard_normal(9))) for _ in range(4)]
+    base = carelessly_mounted(rng, 2.0, 0.02, 0.02)
+    each = [Mounting(*(base.vector[:9] + APART * rng.standard_normal(9))) for _ in range(4)]
     zone = rng.normal(0, 3e-3, (8, 8))
     recordings = [
         record(rng, replace(one, delay_s=rng.uniform(-0.12, 0.12)), zone=zone, turn=turn * DEGREE)[:2]
         for one, turn in zip(each[:3], turns, strict=True)
     ]
     frames, poses = zip(*recordings, strict=True)
-    return calibrate(BOARD, frames, poses, free=FREE, moving=True), Mounting(*base), each[3]
+    return calibrate(BOARD, frames, poses, free=FREE, moving=True), base, each[3]
 
 
 def nees_of_another(found, other):
@@ -1017,11 +1014,9 @@ WRONG = {
 def mistaken(kind, seed):
     """Calibrate with one mistake; return what was said, and the NEES if the result is trusted all the same."""
     rng = np.random.default_rng([5, seed])
-    truth = Mounting(
-        *(1.5 * DEGREE * rng.standard_normal(2)), 0.0, 2 * DEGREE * rng.standard_normal(),
-        22.5 * DEGREE * (1 + 0.02 * rng.standard_normal()), 22.5 * DEGREE, 5e-3 * rng.standard_normal(), 0.8,
-        rng.uniform(-0.12, 0.12) + (-0.5 * (-1) ** seed if kind == "delay" else 0.0),
-    )  # fmt: skip
+    truth = carelessly_mounted(rng, 1.5, 0.02, 5e-3, 0.12, bearing_deg=2.0)
+    if kind == "delay":
+        truth = replace(truth, delay_s=truth.delay_s - 0.5 * (-1) ** seed)
     frames, poses, _ = record(np.random.default_rng([6, seed]), truth)
     reports_z = None
     if kind == "half":
@@ -1045,9 +1040,9 @@ def mistaken(kind, seed):
     return found.cause, math.nan if found.doubts else nees(found, truth)
 
 
-@pytest.mark.parametrize("kind", ["z", "x", "heading", "mm", "half", "delay"])
+@pytest.mark.parametrize("kind", ["x", "heading", "mm", "half", "delay"])
 def test_a_mistake_with_a_recording_is_named(kind):
-    """A delay that is within reach is found instead, and half of the poses left out."""
+    """A delay that is within reach is found instead, and half of the poses left out; z is in a test of its own."""
     said, trusted = mistaken(kind, 4 if kind == "delay" else 1)
     assert WRONG[kind] in said
     assert math.isnan(trusted)

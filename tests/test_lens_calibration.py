@@ -103,7 +103,7 @@ def moving_trial(seed, n):
 
 
 def test_the_lens_of_a_moving_camera_lies_within_its_ellipsoid_together_with_the_delay():
-    value, found, truth = moving_trial(1, 40)
+    value, found, truth = moving_trial(1, 24)
     assert stats.chi2.ppf(5e-4, 10) < value < stats.chi2.ppf(1 - 5e-4, 10)  # 99.9 % of the NEES of 10 numbers
     assert set(found.free) == set(MOVING_FREE)
     for name in FREE[3:]:
