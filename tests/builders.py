@@ -91,19 +91,34 @@ def strangers() -> dict[str, trimesh.Trimesh]:
     box = trimesh.creation.box((0.24, 0.16, 0.15))
     box.apply_translation((0, 0, -0.075))
 
-    def block(x: float, y: float, bottom: float, top: float) -> trimesh.Trimesh:
-        mesh: trimesh.Trimesh = trimesh.creation.box((x, y, top - bottom))
-        mesh.apply_translation((0, 0, (top + bottom) / 2))
-        return mesh
+    def part(x: float, y: float, bottom: float, top: float) -> trimesh.Trimesh:
+        return block((-x / 2, x / 2), (-y / 2, y / 2), (bottom, top))
 
     corners = [[x * 0.075, y * 0.075, 0] for x in (-1, 1) for y in (-1, 1)]
     uppers = {
-        "cube": block(0.13, 0.13, 0, 0.15),
-        "slab": block(0.05, 0.14, 0, 0.15),
-        "table": trimesh.boolean.union([block(0.06, 0.06, 0, 0.1), block(0.14, 0.14, 0.1, 0.15)], engine="manifold"),
+        "cube": part(0.13, 0.13, 0, 0.15),
+        "slab": part(0.05, 0.14, 0, 0.15),
+        "table": trimesh.boolean.union([part(0.06, 0.06, 0, 0.1), part(0.14, 0.14, 0.1, 0.15)], engine="manifold"),
         "pyramid": trimesh.convex.convex_hull(np.array([*corners, [0, 0, 0.15]])),
     }
     return {name: trimesh.boolean.union([box, upper], engine="manifold") for name, upper in uppers.items()}
+
+
+Interval = tuple[float, float]
+
+
+def block(x: Interval, y: Interval, z: Interval) -> trimesh.Trimesh:
+    """Return a box that fills the given intervals of x', y', z'."""
+    low, high = np.array([x, y, z], float).T
+    mesh: trimesh.Trimesh = trimesh.creation.box(high - low)
+    mesh.apply_translation((low + high) / 2)
+    return mesh
+
+
+def sheet(y: Interval, z: Interval, x: float = 0.0) -> trimesh.Trimesh:
+    """Return a rectangle without thickness across the axis x', over the given intervals of y' and z'."""
+    corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
+    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def bowl(rings: int = 128) -> trimesh.Trimesh:

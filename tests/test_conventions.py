@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 import trimesh
+from builders import block, sheet
 
 from phasemark.render import Background, Renderer, Sensor, Views, preset
 
@@ -16,18 +17,6 @@ TAN = math.tan(math.radians(11))
 C_M_S = 299_792_458.0
 PMD = preset("pmd-16x16")
 POINT = PMD.with_(fill_factor=(1e-4, 1e-4))  # sees along the ray of the pixel's centre
-
-
-def block(x, y, z):
-    """Return a box that fills the given intervals of x', y', z'."""
-    low, high = np.array([x, y, z], float).T
-    return trimesh.creation.box(high - low).apply_translation((low + high) / 2)
-
-
-def sheet(y, z, x=0.0):
-    """Return a rectangle without thickness across the axis x', over the given intervals of y' and z'."""
-    corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 BALL = trimesh.creation.icosphere(subdivisions=2, radius=0.02)

@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from builders import error_lines
 
-from phasemark.cli import main
 from phasemark.data import BankPlan
 from phasemark.data.bank import bank_cache
 from phasemark.data.bank.bank_cache import cached_bank
@@ -52,15 +51,9 @@ def cache(tmp_path, monkeypatch):
     return tmp_path / "cache" / "phasemark" / "banks"
 
 
-def run(capsys, *words):
-    code = main([str(word) for word in words])
-    out, err = capsys.readouterr()
-    return code, out, err
-
-
-def test_a_mesh_and_a_log_of_a_board_are_all_that_a_match_takes(folder, cache, capsys):
+def test_a_mesh_and_a_log_of_a_board_are_all_that_a_match_takes(folder, cache, run):
     words = "match", folder / "dock.stl", folder / "recording.txt", "--unit", "mm", "--json"
-    code, out, _ = run(capsys, *words)
+    code, out, _ = run(*words)
     assert code == 0
     (match,) = json.loads(out)["matches"]
     assert match["accepted"]
@@ -71,7 +64,7 @@ def test_a_mesh_and_a_log_of_a_board_are_all_that_a_match_takes(folder, cache, c
     assert match["pitch_deg"] == pytest.approx(np.degrees(0.04), abs=0.5)
     (kept,) = cache.glob("*.h5")
     before = kept.stat().st_ino
-    assert run(capsys, *words, "--method", "nearest", "--no-diagnosis")[0] == 0
+    assert run(*words, "--method", "nearest", "--no-diagnosis")[0] == 0
     assert [path.stat().st_ino for path in cache.glob("*.h5")] == [before]
 
 
@@ -86,10 +79,10 @@ def test_a_mesh_and_a_log_of_a_board_are_all_that_a_match_takes(folder, cache, c
         (("bank.h5", "recording.txt", "--sensor", "vl53l5cx-8x8"), "--sensor goes with a mesh or a class"),
     ],
 )
-def test_options_that_do_not_go_together_are_refused_in_one_line(folder, cache, capsys, monkeypatch, words, message):
+def test_options_that_do_not_go_together_are_refused_in_one_line(folder, cache, run, monkeypatch, words, message):
     monkeypatch.chdir(folder)
     (folder / "plain.csv").write_text(",".join(["700"] * 64) + "\n", encoding="ascii")
-    code, _, err = run(capsys, "match", *words)
+    code, _, err = run("match", *words)
     (line,) = error_lines(err)
     assert code in (2, 3)
     assert message in line

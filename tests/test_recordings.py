@@ -44,19 +44,6 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def run(capsys):
-    """Run a command; return its exit code, standard output and standard error."""
-
-    def run(*arguments):
-        capsys.readouterr()
-        code = main([str(argument) for argument in arguments])
-        done = capsys.readouterr()
-        return code, done.out, done.err
-
-    return run
-
-
-@pytest.fixture
 def drawn(monkeypatch, capsys):
     """Draw nothing, and collect what was printed before each picture."""
     printed = []

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from builders import ODD, joined, l_bracket, star_prism
+from builders import ODD, block, joined, l_bracket, sheet, star_prism
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from oracles.images import (
@@ -33,16 +33,6 @@ POINT = PMD.with_(fill_factor=(1e-4, 1e-4))
 TAN = math.tan(math.radians(11))
 MESHES = {name: build_mesh(spec) for name, spec in catalog().items()}
 CYLINDER = MESHES["cylinder"]
-
-
-def block(x, y, z):
-    low, high = np.array([x, y, z], float).T
-    return trimesh.creation.box(high - low).apply_translation((low + high) / 2)
-
-
-def sheet(y, z, x=0.0):
-    corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
-    return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
 
 
 def epsilon(image, phasor):

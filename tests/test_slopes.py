@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
+from builders import sheet
 from oracles.images import mean_of_blocks, sphere_pixels
 
 from phasemark import UsageError
@@ -109,9 +110,7 @@ def moving_edges(name, distance, bearing, height):
     return exact
 
 
-SHEET = trimesh.Trimesh(
-    [[0, -0.06, -0.05], [0, 0.06, -0.05], [0, 0.06, 0.05], [0, -0.06, 0.05]], [[0, 1, 2], [0, 2, 3]], process=False
-)
+SHEET = sheet((-0.06, 0.06), (-0.05, 0.05))
 # so thin that its sides, which turn away from a lens before its middle, are behind its front
 THIN = trimesh.creation.box((1e-9, 0.12, 0.1))
 
