@@ -679,9 +679,7 @@ def test_crossed_boxes_agree_with_finer_pixels():
 
 
 def test_coverage_is_told_apart_by_part():
-    from phasemark.landmarks import build_mesh, catalog
-
-    image = Renderer(build_mesh(catalog()["sphere"]), preset("pmd-16x16")).render(1.0, 0.3)
+    image = Renderer(MESHES["sphere"], PMD).render(1.0, 0.3)
     # at the interface's height the upper rows see the upper part, the lower rows the lower one
     np.testing.assert_allclose(image.upper_coverage[:, :8], image.coverage[:, :8], atol=1e-12)
     assert image.upper_coverage[:, 8:].max() == 0

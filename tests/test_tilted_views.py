@@ -61,19 +61,10 @@ def test_six_numbers_and_transforms_convert_into_each_other():
     np.testing.assert_allclose(transforms(back), transforms(views), atol=1e-11)
 
 
-@pytest.mark.parametrize(
-    ("view", "words"),
-    [
-        ((1.0, 0.3, 0.1, 0.0, math.pi / 2, 0.4), "straight up or down"),
-        ((1.0, 0.3, 0.1, 0.0, -math.pi / 2, 0.0), "straight up or down"),
-    ],
-)
-def test_transforms_without_one_set_of_six_numbers_are_refused(view, words):
-    with pytest.raises(UsageError, match=words):
-        Views.from_landmark2cam(transforms(Views.broadcast(*view)))
-
-
-def test_a_lens_on_the_axis_and_what_is_no_rotation_are_refused():
+def test_transforms_without_one_set_of_six_numbers_are_refused():
+    for pitch, roll in ((math.pi / 2, 0.4), (-math.pi / 2, 0.0)):
+        with pytest.raises(UsageError, match="straight up or down"):
+            Views.from_landmark2cam(transforms(Views.broadcast(1.0, 0.3, 0.1, 0.0, pitch, roll)))
     pose = np.eye(4)
     pose[2, 3] = 0.3
     with pytest.raises(UsageError, match=r"on the landmark's axis.*matrix 0"):
