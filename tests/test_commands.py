@@ -73,11 +73,10 @@ def test_the_table_has_a_line_a_position(run, folder, tmp_path):
 
 def test_no_landmark_is_an_answer(run, folder, tmp_path):
     np.savetxt(tmp_path / "wall.csv", np.full((5, 256), 3.0) + np.linspace(0, 1e-3, 5)[:, None], delimiter=",")
-    for method in ("nearest", "refine"):
-        command = ["match", folder / "bank.h5", tmp_path / "wall.csv", "--unit", "m", "--quantity", "z"]
-        code, out, _ = run(*command, "--method", method, "--no-diagnosis")
-        assert code == 0
-        assert "no landmark" in out
+    command = ["match", folder / "bank.h5", tmp_path / "wall.csv", "--unit", "m", "--quantity", "z"]
+    code, out, _ = run(*command, *NEAREST, "--no-diagnosis")
+    assert code == 0
+    assert "no landmark" in out
 
 
 def test_the_mean_phasor_is_the_other_filter(run, folder):
