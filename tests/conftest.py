@@ -26,12 +26,15 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 _LONGEST = {
     f"test_{name}.py"
     for name in (
-        "agreement", "calibrate", "cells", "diagnosis", "direct_fit", "drive", "frequency_matching",
-        "histogram_backgrounds", "histogram_matching", "lens_calibration", "recordings", "refine", "sweep_report",
-        "tilted_matching",
+        "agreement", "bounces", "calibrate", "cells", "diagnosis", "direct_fit", "drive", "frequency_matching",
+        "histogram_backgrounds", "histogram_matching", "lens_calibration", "locate", "recordings", "refine",
+        "sweep_report", "tilted_matching",
     )
 }  # fmt: skip
-"""Files of tests that take longest. They go first: a worker that began one of them last would work alone."""
+"""Files of tests that take longest. They go first: a worker that began one of them last would work alone.
+
+So do files that compile what the next file calls too: the other worker would compile it at the same time.
+"""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
