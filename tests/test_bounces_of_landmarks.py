@@ -17,6 +17,7 @@ from phasemark.cli import main
 from phasemark.data import Bank, build_bank
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.accuracy import accuracy_card, multipath_shift
+from phasemark.matcher.calibration import KnownPoses, Mounting, calibrate
 from phasemark.matcher.diagnosis.search import wider
 from phasemark.matcher.likelihood.systematic import carried_covariances, carried_errors
 from phasemark.render import (
@@ -272,3 +273,33 @@ def test_bounces_that_no_renderer_computes_are_refused(mesh: trimesh.Trimesh, se
         Renderer(mesh, sensor.with_(lamp_half_angle_deg=None)).render(1.0, background=behind)
     with pytest.raises(UsageError, match="without one, put wall and floor into a Scene"):
         Renderer(None, sensor).render(1.0, background=behind)
+
+
+def test_a_calibration_estimates_the_albedo_of_a_floor_off_which_light_bounces(
+    sensor: Sensor, mesh: trimesh.Trimesh
+) -> None:
+    behind = Background(floor_m=0.15, floor_albedo=0.5, bounces="all")
+    truth = Mounting.of_sensor(sensor.with_(pitch_deg=0.8, range_offset_m=0.004), 0.8)
+    poses = KnownPoses.polar(np.array([0.9, 1.0, 1.0]), np.radians([0.0, 8.0, -8.0]))
+    still = np.zeros(len(poses))
+    image = Renderer(mesh, truth.on(sensor)).render_views(
+        Views(poses.distance_m, poses.delta_rad, still, still), background=behind
+    )
+    frames = kalman_filter(capture(image, truth.on(sensor), rng=np.random.default_rng(3), n_frames=50))
+    frames = replace(frames, sensor=sensor)
+    free = "pitch", "range_offset"
+    assumed = replace(behind, floor_albedo=0.33, floor_albedo_std=0.16)
+    found = calibrate(mesh, frames, poses, free=[*free, "floor_albedo"], background=assumed)
+    for name, true in (("floor_albedo", 0.5), ("pitch", truth.pitch_rad), ("range_offset", 0.004)):
+        assert abs(found.value(name) - true) < 4 * found.std(name)
+    assert 0 < found.std("floor_albedo") < 0.05
+    assert found.p_value > 0.01
+    assert "floor_albedo = 0." in found.to_toml(base_name="pmd-16x16")
+    direct = calibrate(mesh, frames, poses, free=free, background=replace(behind, bounces=0))
+    assert direct.value("range_offset") - 0.004 > 10 * found.std("range_offset")  # all of the light that came late
+    with pytest.raises(UsageError, match="stated with a standard deviation"):
+        calibrate(mesh, frames, poses, free=["pitch", "floor_albedo"], background=behind)
+    with pytest.raises(UsageError, match="'on' = ranges"):
+        calibrate(mesh, frames, poses, free=free, background=behind, on="phasors")
+    with pytest.raises(UsageError, match="light that bounces takes still poses"):
+        calibrate(mesh, frames, poses, free=free, background=behind, moving=True)

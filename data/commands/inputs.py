@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
@@ -141,6 +141,26 @@ def background_of(wall: float | None, floor: float | None, bounces: str = "0") -
             raise UsageError("--bounces needs something that light bounces off: give --wall, --floor or both")
         return None
     return Background(wall_m=wall, floor_m=floor, bounces="all" if bounces == "all" else int(bounces))
+
+
+def background_to_estimate(
+    wall: float | None, floor: float | None, bounces: str, floor_albedo: float | None
+) -> Background | None:
+    """Return the background that the options state; where light bounces, with a floor of any usual albedo, or its own.
+
+    Raises
+    ------
+    UsageError
+        Light is to bounce off nothing, or the albedo is that of no floor off which it bounces.
+    """
+    if floor_albedo is not None and (floor is None or bounces == "0"):
+        raise UsageError("--floor-albedo goes with --floor and --bounces: nothing else depends on it")
+    behind = background_of(wall, floor, bounces)
+    if behind is None or not behind.bounces:
+        return behind
+    if floor_albedo is not None:
+        return replace(behind, floor_albedo=floor_albedo)
+    return replace(behind, floor_albedo=0.33, floor_albedo_std=0.16)  # of floors that return 0.05 to 0.6
 
 
 def note_too_far(sensor: Sensor, distances_m: Mapping[str, float | None], *, in_histograms: bool = False) -> None:

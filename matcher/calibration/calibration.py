@@ -83,7 +83,9 @@ def calibrate(
         ranges. "reported": ranges as the chip of a direct sensor with a [histogram] table makes them, of the nearest
         surface of each zone; zones that a landmark fills in part then count, whatever stands behind it.
     background : Background, optional
-        What stands behind; a pose's own `wall_m` replaces its wall. Without one, where more than a few pixels return
+        What stands behind; a pose's own `wall_m` replaces its wall. With `bounces`, on ranges of still poses, light
+        that bounces is computed at the mounting that is assumed and again at the one found; the albedo of the floor is
+        estimated if its standard deviation is positive. Without a background, where more than a few pixels return
         beside the landmark, only those that see nothing else count.
     pose_std : PoseStd, optional
         How well the poses are known; then their errors are estimated too. None: they are taken as exact, and if
@@ -116,7 +118,12 @@ def calibrate(
     camera = first[0].sensor
     one = OneFrequency(camera, "combined") if len(camera.frequencies_hz) > 1 else None
     recorded = moving or bool(zones) or on == "reported"
-    quantity = _quantity(first[0], on, recorded)
+    bounces = background is not None and bool(background.bounces)
+    if bounces and recorded:
+        raise UsageError("light that bounces takes still poses, ranges as measured and no offsets of zones")
+    quantity = _quantity(first[0], "ranges" if bounces and on == "auto" else on, recorded)
+    if bounces and quantity == "phasors":
+        raise UsageError("light that bounces takes 'on' = ranges")
     sensor = camera if one is None else one.frames(first[0]).sensor
     if zones and sensor.kind != "direct":
         raise UsageError("offsets of zones belong to sensors of 'kind' = 'direct'")
@@ -128,13 +135,13 @@ def calibrate(
         )
     lit = quantity == "phasors" or behind
     usual_renderings = 400  # of all poses: what a progress bar reckons with
-    names = _names(free, fixed, sensor, lit, moving, recorded)
+    names = _names(free, fixed, sensor, lit and not bounces, moving, recorded, background)
     if zones is None:  # a delay alone leaves what a calibration found of the zones
         zones = moving and names != ("delay",)
     problem_of = partial(
         Problem,
         mesh,
-        assumed=_assumed(start, sensor, albedo),
+        assumed=_assumed(start, sensor, albedo, background),
         names=names,
         on=quantity,
         background=background,
@@ -207,28 +214,47 @@ def _quantity(frames: FilteredFrames, on: Explained, recorded: bool) -> Residual
 
 
 def _names(
-    free: Sequence[str] | None, fixed: Sequence[str], sensor: Sensor, lit: bool, moving: bool, recorded: bool
+    free: Sequence[str] | None,
+    fixed: Sequence[str],
+    sensor: Sensor,
+    lit: bool,
+    moving: bool,
+    recorded: bool,
+    background: Background | None,
 ) -> tuple[str, ...]:
     """Return the names of the free parameters; refuse those that these frames cannot tell."""
     lens = sensor.lens
     names = (MOUNTING_NAMES if moving else NAMES) if free is None else check_names(free, "'free'", lens)
     if "delay" in names and not moving:
         raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
+    floor_is_free = background is not None and background.estimates_floor_albedo
+    if free is not None and "floor_albedo" in names and not floor_is_free:
+        raise UsageError(
+            "the albedo of the floor takes a floor off which light bounces and whose albedo is stated with a standard"
+            " deviation"
+        )
     if recorded and free is not None and "albedo" in names:
         raise UsageError("the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo")
     left = {*check_names(fixed, "'fixed'", lens), *(() if lens is None else HALF_ANGLES)}
     if recorded or (free is None and not lit):
         left.add("albedo")
+    if not floor_is_free:
+        left.add("floor_albedo")
     names = tuple(name for name in names if name not in left)
     if not names:
         raise UsageError("nothing is free: there is nothing to calibrate")
     if "albedo" in names and not lit:
-        raise UsageError("the albedo takes amplitudes, or a wall or floor behind: ranges alone do not tell it")
+        raise UsageError(
+            "the albedo takes amplitudes, or a wall or floor behind off which no light bounces: ranges alone do not"
+            " tell it"
+        )
     return names
 
 
-def _assumed(start: Mounting | None, sensor: Sensor, albedo: float) -> Mounting:
+def _assumed(start: Mounting | None, sensor: Sensor, albedo: float, background: Background | None) -> Mounting:
     """Return the initial guess of the mounting, with the lens of the sensor unless it states its own.
+
+    The albedo of the floor is that of the background.
 
     Raises
     ------
@@ -236,7 +262,9 @@ def _assumed(start: Mounting | None, sensor: Sensor, albedo: float) -> Mounting:
         Its lens is of another kind than that of the sensor, or not for this image.
     """
     if start is None:
-        return Mounting.of_sensor(sensor, albedo)
+        start = Mounting.of_sensor(sensor, albedo)
+    if background is not None:
+        start = replace(start, floor_albedo=background.floor_albedo)
     if start.lens is None:
         return start if sensor.lens is None else replace(start, lens=sensor.lens)
     start.on(sensor)

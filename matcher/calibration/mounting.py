@@ -1,9 +1,10 @@
 """Parameters of a calibration, and the mounting that they make up.
 
-The mounting is nine numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
+The mounting is ten numbers, :class:`Mounting`. Four of them turn or widen the camera itself (pitch, roll and both
 half angles), two move the landmark in its image (height and bearing), one delays the light (range offset), one the time
-stamps (delay, for a moving camera), and one is the brightness of the landmark (albedo), which is not the camera's.
-Where the camera has a lens, its terms follow these nine, and both half angles follow from it.
+stamps (delay, for a moving camera), and two are not the camera's: the brightness of the landmark (albedo) and of a
+floor off which light bounces (floor_albedo). Where the camera has a lens, its terms follow these ten, and both half
+angles follow from it.
 """
 
 from __future__ import annotations
@@ -81,6 +82,7 @@ PARAMETERS = {
         Parameter("range_offset", "range offset", "range_offset_m", *_LENGTH, "range_offset_m", prior=0.05),
         Parameter("albedo", "albedo", "albedo", 0.1, 1.0, "", None, (1e-3, math.inf)),
         Parameter("delay", "delay", "delay_s", 0.01, 1e3, "ms", "delay_s", (-10.0, 10.0), 0.2),
+        Parameter("floor_albedo", "albedo of the floor", "floor_albedo", 0.1, 1.0, "", None, (0.02, 0.98), 0.16),
         *(Parameter(f, f"focal length {f}", None, *_PIXELS, LENS_FIELD + f, prior=0.05) for f in TERMS[:2]),
         *(Parameter(c, f"principal point {c}", None, *_PIXELS, LENS_FIELD + c, prior=2.0) for c in TERMS[2:4]),
         *(Parameter(k, f"distortion {k}", None, 1.0, 1.0, "", LENS_FIELD + k, prior=3.0) for k in TERMS[4:]),
@@ -92,7 +94,7 @@ ALL_NAMES = tuple(PARAMETERS)
 MOUNTING_NAMES = tuple(name for name in ALL_NAMES if name not in TERMS)
 """All but the terms of a lens, which follow in the vector."""
 HALF_ANGLES = ("half_angle_h", "half_angle_v")
-NAMES = MOUNTING_NAMES[:-1]
+NAMES = tuple(name for name in MOUNTING_NAMES if name != "delay")
 """What frames from still poses can tell; the delay takes a moving camera."""
 _RELATIVE = (*HALF_ANGLES, "fx", "fy")
 """What has a prior relative to its assumed value."""
@@ -117,7 +119,7 @@ def prior_std(name: str, assumed: NDArray[np.float64], scale: NDArray[np.float64
     Parameters
     ----------
     name : str
-    assumed, scale : (21,) float64
+    assumed, scale : (22,) float64
         What is assumed, and natural units.
     """
     column, std = ALL_NAMES.index(name), PARAMETERS[name].prior
@@ -206,6 +208,8 @@ class Mounting:
         Of the landmark.
     delay_s : float
         Added to the stamp of a frame to get the time at which the camera was where the frame shows it.
+    floor_albedo : float
+        Of a floor behind the landmark, where light bounces.
     lens : Lens, optional
         Of the camera; then both half angles follow from it. None: the ideal lens.
     """
@@ -219,6 +223,7 @@ class Mounting:
     range_offset_m: float
     albedo: float
     delay_s: float = 0.0
+    floor_albedo: float = 0.5
     lens: Lens | None = None
 
     @classmethod
@@ -237,7 +242,7 @@ class Mounting:
 
         Parameters
         ----------
-        theta : (21,) float64
+        theta : (22,) float64
             The numbers in the order of the fields, metres and radians.
         sensor : Sensor
             Whose kind of lens the terms belong to, if it has one.
@@ -258,7 +263,7 @@ class Mounting:
 
     @property
     def vector(self) -> NDArray[np.float64]:
-        """The numbers in the order of :data:`ALL_NAMES`, (21,); 0 for terms that no lens has."""
+        """The numbers in the order of :data:`ALL_NAMES`, (22,); 0 for terms that no lens has."""
         terms = {} if self.lens is None else self.lens.terms
         return np.array(
             [getattr(self, one.attribute) if one.attribute else terms.get(one.name, 0.0) for one in PARAMETERS.values()]

@@ -54,6 +54,8 @@ _HALVINGS = 12
 """How often a step that leads to no lens is halved before it is not taken."""
 _FULL = 1 - 1e-6
 """Coverage of a pixel that sees nothing but the landmark."""
+_FLOORS = 0.5 + 0.48 * np.cos(np.pi * (np.arange(5) + 0.5) / 5)
+"""Albedos of the floor at which light that bounces is computed: Chebyshev's nodes, between which a polynomial goes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ def range_residual(evidence: Evidence, images: Images) -> _Float:
 
 
 def natural_units(sensor: Sensor) -> _Float:
-    """Return the natural units of all parameters, with those of the terms of a sensor's lens, (21,)."""
+    """Return the natural units of all parameters, with those of the terms of a sensor's lens, (22,)."""
     rates = {} if sensor.lens is None else lens_rates(sensor.lens, sensor.rows, sensor.cols)
     own = {name: _TERM_UNIT / rate for name, rate in rates.items()}
     return np.array([own.get(name, one.scale) for name, one in PARAMETERS.items()])
@@ -97,7 +99,7 @@ def stretch_of(sensor: Sensor, theta: _Float) -> float:
     ----------
     sensor : Sensor
         With a lens, whose model and number of coefficients are kept.
-    theta : (21,) float64
+    theta : (22,) float64
         In the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
     """
     assert sensor.lens is not None
@@ -163,6 +165,7 @@ class CalibrationModel:
         self.step = np.where(np.isin(ALL_NAMES, TERMS), self.scale / math.radians(1.0), 1.0) * STEP
         """Half the width of a difference in each: for terms of the lens, what moves the image by :data:`STEP`."""
         self._axis_cosine = self.sensor.axis_cosine() if self.reports_z else None
+        self._bounced: list[PhasorImages] = []
         self._renderer = self._rendering()
         self._scenes = [(np.arange(len(self.poses)), self.background)]
         if self.poses.wall_m is not None:
@@ -192,7 +195,7 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta, step : (21,) float64
+        theta, step : (22,) float64
             In the order of :data:`ALL_NAMES`; the first has a lens that does not fold.
         """
         there = clipped(theta + step)
@@ -225,6 +228,22 @@ class CalibrationModel:
         return high, low, float(high[column] - low[column]) or 2 * half
 
     @property
+    def light_bounces(self) -> bool:
+        """Whether light bounces off what stands behind the landmark."""
+        return any(background is not None and background.bounces for _, background in self._scenes)
+
+    def let_bounce(self, theta: _Float) -> None:
+        """Compute the light that bounces at a mounting; until the next call it stays as it is beside direct light."""
+        views, self._bounced = self._views(theta, None), []
+        floor = ALL_NAMES.index("floor_albedo")
+        for albedo in _FLOORS:
+            there = theta.copy()
+            there[floor] = albedo
+            direct, whole = (self._render(self.mounting(there), views, direct=direct) for direct in (True, False))
+            self._bounced.append(replace(whole, phasor=whole.phasor - direct.phasor,
+                                         intensity=whole.intensity - direct.intensity))  # fmt: skip
+
+    @property
     def has_background(self) -> bool:
         """Whether anything is known to stand behind the landmark."""
         return any(background is not None for _, background in self._scenes)
@@ -239,7 +258,7 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (21,) float64
+        theta : (22,) float64
             Initial guess of the mounting.
         slack_m : float
 
@@ -265,7 +284,7 @@ class CalibrationModel:
 
         Parameters
         ----------
-        theta : (21,) float64
+        theta : (22,) float64
             The mounting.
         shift : (K, s) float64, optional
             What is added to the first s numbers of the views of the poses.
@@ -310,7 +329,7 @@ class CalibrationModel:
         names : sequence of str
             Parameters of the mounting, and of :data:`EFFECTS` errors of the poses.
         on : {"ranges", "phasors"}
-        width : (21,) float64, optional
+        width : (22,) float64, optional
             Half width of each difference; at least :attr:`step`.
 
         Returns
@@ -396,22 +415,40 @@ class CalibrationModel:
             seen[:, : shift.shape[1]] += shift
         return Views(*np.ascontiguousarray(seen.T))
 
-    def _render(self, mounting: Mounting, views: Views, *, alone: bool = False) -> PhasorImages:
+    def _render(self, mounting: Mounting, views: Views, *, alone: bool = False, direct: bool = True) -> PhasorImages:
+        """Render views: the landmark `alone`, or with what stands behind, of bouncing light what was computed before.
+
+        Not `direct`: with the light that bounces at this mounting.
+        """
         renderer = self._renderer.seen_by(mounting.on(self.sensor))
         vertices = self._renderer.topology.vertices
         self.rendered()
 
         def seen(views: Views, background: Background | None) -> PhasorImages:
             if background is not None:
+                bounces = 0 if direct else background.bounces
+                background = replace(background, floor_albedo=mounting.floor_albedo, bounces=bounces)
                 background = background.giving_way(vertices, views.in_camera(renderer.sensor))
             return renderer.render_views(views, background=background)
 
-        if alone or len(self._scenes) == 1:
-            return seen(views, None if alone else self._scenes[0][1])
+        if alone:
+            return seen(views, None)
+        if len(self._scenes) == 1:
+            return self._with_bounced(seen(views, self._scenes[0][1]), mounting.floor_albedo)
         parts = [seen(views[which], background) for which, background in self._scenes]
         back = np.argsort(np.concatenate([which for which, _ in self._scenes]))
         phasor, intensity, coverage = (
             np.concatenate([getattr(part, name) for part in parts])[back]
             for name in ("phasor", "intensity", "coverage")
         )
-        return PhasorImages(phasor, intensity, coverage, renderer.sensor, views)
+        image = PhasorImages(phasor, intensity, coverage, renderer.sensor, views)
+        return self._with_bounced(image, mounting.floor_albedo)
+
+    def _with_bounced(self, image: PhasorImages, floor_albedo: float) -> PhasorImages:
+        """Return an image with the light that bounces, by Lagrange's polynomial in the albedo of the floor."""
+        phasor, intensity = image.phasor, image.intensity
+        for k, one in enumerate(self._bounced):
+            others = np.delete(_FLOORS, k)
+            share = np.prod((floor_albedo - others) / (_FLOORS[k] - others))
+            phasor, intensity = phasor + share * one.phasor, intensity + share * one.intensity
+        return replace(image, phasor=phasor, intensity=intensity)

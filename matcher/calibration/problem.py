@@ -205,7 +205,7 @@ class Solution(Fitted):
     ----------
     problem : Problem
         What was solved: of a moving camera with the frames that have a pose.
-    theta : (21,) float64
+    theta : (22,) float64
         Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
     use : (K, pixels) bool
         Which pixels count.

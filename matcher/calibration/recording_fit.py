@@ -112,7 +112,7 @@ class Place(NamedTuple):
     """Mounting, zone offsets and what each recording has of its own, in a descent."""
 
     theta: _Float
-    """(21,): mounting."""
+    """(22,): mounting."""
     zone: _Float
     """(pixels,): zone offsets, metres."""
     own: _Float

@@ -41,14 +41,14 @@ def register(model: CalibrationModel, evidence: Evidence, theta: _Float, free: S
     ----------
     model : CalibrationModel
     evidence : Evidence
-    theta : (21,) float64
+    theta : (22,) float64
         Initial guess of the mounting.
     free : sequence of str
         What may move.
 
     Returns
     -------
-    (21,) float64
+    (22,) float64
     """
     if not free:
         return theta

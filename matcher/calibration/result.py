@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
-from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
+from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, PARAMETERS, Mounting
 from phasemark.matcher.calibration.problem import Fitted, Solution, rms
 from phasemark.matcher.calibration.recording_effects import own_title
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -22,7 +22,10 @@ from phasemark.render.integral.rounding import error_text, value_and_error, with
 from phasemark.render.sensor.lens_fields import DERIVED, TERMS
 from phasemark.render.sensor.sensor_file import rounded, sensor_toml
 
-USES = {"albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan"}
+USES = {
+    "albedo": "of the landmark: phasemark bank build --albedo, or 'albedo' in a plan",
+    "floor_albedo": "of the floor: phasemark match --bounces … --floor-albedo",
+}
 """Where the numbers go that a sensor file has no place for."""
 _NOISE, _UNEXPLAINED = "calibrated: noise law of the residuals", "calibrated: what noise does not explain"
 _COMMON = {
@@ -225,8 +228,9 @@ class Calibration(Fitted):
 
 
 def shown_names(found: Calibration) -> tuple[str, ...]:
-    """Return the names of the numbers to show: a delay where it was estimated or is stated, half angles or a lens."""
-    names = MOUNTING_NAMES if "delay" in found.free or found.mounting.delay_s else NAMES
+    """Return the names of the numbers to show: half angles or a lens, a delay and a floor where they were estimated."""
+    left = {"delay"} if not found.mounting.delay_s else set[str]()
+    names = tuple(name for name in MOUNTING_NAMES if name in found.free or name not in left | {"floor_albedo"})
     if found.mounting.lens is None:
         return names
     return (*(name for name in names if name not in HALF_ANGLES), *found.mounting.lens.terms)

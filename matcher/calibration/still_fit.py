@@ -93,6 +93,8 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
         return StillFit(model, evidence, problem.names, factor, edges=edges, noise_measured=noise_measured)
 
     fit = fit_with(pose_std)
+    if model.light_bounces:
+        model.let_bounce(problem.assumed.vector)
     theta = fit.start(problem.assumed.vector)
     use = fit.pixels(model.images(theta), cautious=True)
     check_pixels(use, poses)
@@ -101,6 +103,9 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
     estimated = None
     try:
         place = fit.solve(theta, use)
+        if model.light_bounces:
+            model.let_bounce(place.theta)
+            place = fit.solve(place.theta, place.use)
         if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
             place = fit.search(place)
         if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
@@ -181,7 +186,7 @@ class Place:
 
     Parameters
     ----------
-    theta : (21,) float64
+    theta : (22,) float64
         Mounting, in the order of :data:`~phasemark.matcher.calibration.mounting.ALL_NAMES`.
     u : (K, q) float64
         Errors of the poses, of unit variance each.
@@ -317,7 +322,7 @@ class StillFit:
 
         Parameters
         ----------
-        theta : (21,) float64
+        theta : (22,) float64
         use : (K, pixels) bool
         shift : (K, 3) float64, optional
             Errors of the poses to start from; None: none.

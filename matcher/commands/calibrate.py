@@ -14,8 +14,9 @@ from phasemark import InputFileError, UsageError
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable
 from phasemark.data.commands.flag_wording import in_flags
-from phasemark.data.commands.inputs import background_of, class_mesh, note_too_far, open_any_bank, read_sensor
+from phasemark.data.commands.inputs import background_to_estimate, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
+    BouncesOfLight,
     ClassName,
     Degrees,
     Floor,
@@ -69,6 +70,8 @@ def calibrate_camera(
     on: Literal["auto", "ranges", "reported", "phasors"] = "auto",
     wall: Wall = None,
     floor: Floor = None,
+    bounces: BouncesOfLight = "0",
+    floor_albedo: float | None = None,
     reading: FrameReading,
     plot: Path | None = None,
     rig_file: Path | None = None,
@@ -81,9 +84,10 @@ def calibrate_camera(
     """Find how a camera is mounted from frames of a landmark taken at known positions.
 
     Estimated are, by the names that --free and --fix take: pitch, roll, height, bearing, half_angle_h, half_angle_v
-    (both: fov), range_offset, from amplitudes the landmark's albedo, and with --moving the delay of the stamps. A
-    sensor with a lens has its terms in place of half angles, estimated where --free names them: fx, fy, cx, cy, k1,
-    k2 ... (all: lens). A result that cannot be trusted is not written (exit code 3) without --write-distrusted.
+    (both: fov), range_offset, from amplitudes the landmark's albedo, with --floor and --bounces that of the floor
+    (floor_albedo), and with --moving the delay of the stamps. A sensor with a lens has its terms in place of half
+    angles, estimated where --free names them: fx, fy, cx, cy, k1, k2 ... (all: lens). A result that cannot be trusted
+    is not written (exit code 3) without --write-distrusted.
 
     With --rig and --map: what several range sensors on one robot share, from recordings whose stops have poses. All
     arguments are recordings; --free takes yaw, position, delay, offset, scale, fov and walls.
@@ -132,6 +136,8 @@ def calibrate_camera(
     on
         What is explained: ranges, ranges as a chip reports them (reported), or phasors, which use amplitudes too; auto
         chooses.
+    floor_albedo
+        With --floor and --bounces: albedo of the floor; estimated between 0.05 and 0.6 unless stated.
     plot
         The figure of the residuals, .png; beside the sensor file otherwise.
     rig_file
@@ -154,7 +160,7 @@ def calibrate_camera(
     refuse_other_files(out, ".toml", "the sensor")
     refuse_other_files(figure, ".png")
     refuse_existing([out, figure], force)
-    background = background_of(wall, floor)
+    background = background_to_estimate(wall, floor, bounces, floor_albedo)
     mesh, base, base_name = _calibration_target(bank_or_class, class_name, sensor)
     yaw = math.radians(landmark_yaw)
     known = [read_poses(path, landmark_xy_m=landmark_xy, landmark_yaw_rad=yaw) for path in poses]

@@ -12,7 +12,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from phasemark import UsageError
 from phasemark.data.commands.command import Shown, stated_flags
 from phasemark.data.commands.console import LongWork, tell
-from phasemark.data.commands.inputs import background_of, open_any_bank, read_landmark, read_sensor, sensor_of_board
+from phasemark.data.commands.inputs import (
+    background_to_estimate,
+    open_any_bank,
+    read_landmark,
+    read_sensor,
+    sensor_of_board,
+)
 from phasemark.data.commands.options import (
     BouncesOfLight,
     Degrees,
@@ -46,8 +52,6 @@ _REFINED = (
 )  # fmt: skip
 """Options of :class:`Search` that the nearest image does not have."""
 
-_FLOOR_ALBEDO = 0.33, 0.16
-"""Mean and standard deviation of what floors return, of 0.05 to 0.6."""
 _FREE = {"bearing": "bearing_rad", "height": "height_m", "pitch": "pitch_rad", "roll": "roll_rad"}
 
 
@@ -122,13 +126,7 @@ class Search:
     @property
     def background(self) -> Background | None:
         """What stands behind the landmark, as far as it is stated."""
-        behind = background_of(self.wall, self.floor, self.bounces)
-        if behind is None or not behind.bounces:
-            return behind
-        if self.floor_albedo is not None:
-            return replace(behind, floor_albedo=self.floor_albedo)
-        mean, std = _FLOOR_ALBEDO
-        return replace(behind, floor_albedo=mean, floor_albedo_std=std)
+        return background_to_estimate(self.wall, self.floor, self.bounces, self.floor_albedo)
 
     @property
     def behind(self) -> Background | Literal["auto", "unknown", "any"] | None:
@@ -170,8 +168,6 @@ class Search:
     def check(self) -> None:
         """Refuse options that contradict each other."""
         stated = self.background is not None
-        if self.floor_albedo is not None and (self.floor is None or self.bounces == "0"):
-            raise UsageError("--floor-albedo goes with --floor and --bounces: nothing else depends on it")
         if self.auto_background and stated:
             raise UsageError("--auto-background estimates wall and floor: leave --wall and --floor out")
         if self.unknown_background and (self.auto_background or stated):
