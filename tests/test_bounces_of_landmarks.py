@@ -297,7 +297,7 @@ def test_a_calibration_estimates_the_albedo_of_a_floor_off_which_light_bounces(
     assert "floor_albedo = 0." in found.to_toml(base_name="pmd-16x16")
     direct = calibrate(mesh, frames, poses, free=free, background=replace(behind, bounces=0))
     assert direct.value("range_offset") - 0.004 > 10 * found.std("range_offset")  # all of the light that came late
-    with pytest.raises(UsageError, match="stated with a standard deviation"):
+    with pytest.raises(UsageError, match="a positive floor_albedo_std of the background"):
         calibrate(mesh, frames, poses, free=["pitch", "floor_albedo"], background=behind)
     with pytest.raises(UsageError, match="'on' = ranges"):
         calibrate(mesh, frames, poses, free=free, background=behind, on="phasors")

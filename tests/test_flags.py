@@ -87,6 +87,8 @@ def test_every_parameter_that_becomes_a_flag_is_named_by_a_message_and_is_an_opt
         ("part=… must be I/N", "--shard must be I/N"),
         ("part=3/8 would be empty", "--shard 3/8 would be empty"),
         ("give fixed=pitch or fixed=roll", "give --fix pitch or --fix roll"),
+        ("takes bounces and a positive floor_albedo_std of the background",
+         "takes --bounces, without --floor-albedo"),
         ("state it with Mounting(delay_s=…) and give fixed=delay", "state it with --delay-ms and give --fix delay"),
         ("(state yours with pose_std=…)", "(state yours with --position-std, --heading-std and --delta-std)"),
         ("says 1 (unverified() reads it all the same)", "says 1 (--no-verify reads it all the same)"),

@@ -229,10 +229,7 @@ def _names(
         raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
     floor_is_free = background is not None and background.estimates_floor_albedo
     if free is not None and "floor_albedo" in names and not floor_is_free:
-        raise UsageError(
-            "the albedo of the floor takes a floor off which light bounces and whose albedo is stated with a standard"
-            " deviation"
-        )
+        raise UsageError("the albedo of the floor takes bounces and a positive floor_albedo_std of the background")
     if recorded and free is not None and "albedo" in names:
         raise UsageError("the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo")
     left = {*check_names(fixed, "'fixed'", lens), *(() if lens is None else HALF_ANGLES)}
