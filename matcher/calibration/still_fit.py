@@ -105,7 +105,7 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
         place = fit.solve(theta, use)
         if model.light_bounces:
             model.let_bounce(place.theta)
-            place = fit.solve(place.theta, place.use)
+            place = fit.solve(place.theta, place.use, place.shift)
         if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
             place = fit.search(place)
         if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:

@@ -27,8 +27,7 @@ _Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _TOUCH_M = 1e-3
 """Walls that meet within this touch and do not cross."""
 _TALLEST_M = 20.0
-"""Of a wall in a scene, above and below the sensors: beyond what they reach, and a renderer works in single precision
-there."""
+"""Of a wall in a scene, above and below the sensors: far beyond their reach, and near enough for single precision."""
 _FLOOR_M = 40.0
 """By how much a floor extends beyond the walls."""
 
@@ -86,7 +85,7 @@ class Wall(PlanModel):
         low = max(self.base_m, height_m - _TALLEST_M)
         high = max(min(self.base_m + self.height_m, height_m + _TALLEST_M), low + _TOUCH_M)
         (ax, ay), (bx, by) = self.from_m, self.to_m
-        pose = _placed((ax + bx) / 2, (ay + by) / 2, (low + high) / 2, math.atan2(by - ay, bx - ax))
+        pose = _level_pose((ax + bx) / 2, (ay + by) / 2, (low + high) / 2, math.atan2(by - ay, bx - ax))
         length = math.dist(self.from_m, self.to_m)
         if self.thickness_m:
             return Body.box((length + self.thickness_m, self.thickness_m, high - low), pose=pose)
@@ -94,7 +93,7 @@ class Wall(PlanModel):
         return Body.plane((length, high - low), pose=pose @ upright)
 
 
-def _placed(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> _Float:
+def _level_pose(x_m: float, y_m: float, z_m: float, yaw_rad: float) -> _Float:
     """Return the rigid transform of a body at a place, with a heading, (4, 4)."""
     pose = np.eye(4)
     pose[:2, :2] = turn_of(yaw_rad)[:2, :2]
@@ -112,7 +111,7 @@ class _Placed(PlanModel):
 
     def _pose(self, above_m: float = 0.0) -> _Float:
         """Return the transform of a point of its own axis, above its base, (4, 4)."""
-        return _placed(self.x_m, self.y_m, self.z_m + above_m, math.radians(self.yaw_deg))
+        return _level_pose(self.x_m, self.y_m, self.z_m + above_m, math.radians(self.yaw_deg))
 
     def _placed(self, segments: _Float) -> _Float:
         """Return segments (m, 4) of the body's frame in that of the map."""
@@ -247,7 +246,7 @@ class WallMap(PlanModel):
         return (*self.wall, *short)
 
     @property
-    def _placed(self) -> tuple[Box | MeshBody | LandmarkBody, ...]:
+    def _bodies(self) -> tuple[Box | MeshBody | LandmarkBody, ...]:
         return (*self.box, *self.mesh, *self.landmark)
 
     @property
@@ -269,7 +268,7 @@ class WallMap(PlanModel):
             Nothing of the map is as high as the sensors.
         """
         walls = self.walls
-        bodies = self._placed
+        bodies = self._bodies
         seen = [wall.base_m <= self.height_m <= wall.base_m + wall.height_m for wall in walls]
         groups = [wall.outline() if high else np.empty((0, 4)) for wall, high in zip(walls, seen, strict=True)]
         groups += [body.outline(self.height_m) for body in bodies]
@@ -284,9 +283,9 @@ class WallMap(PlanModel):
 
     def scene(self) -> Scene:
         """Return walls, bodies and the floor as a scene."""
-        bodies = [*(wall.body(self.height_m) for wall in self.walls), *(one.body() for one in self._placed)]
+        bodies = [*(wall.body(self.height_m) for wall in self.walls), *(one.body() for one in self._bodies)]
         low_x, low_y, high_x, high_y = self.outline().bounds_m
-        middle = _placed((low_x + high_x) / 2, (low_y + high_y) / 2, self.floor_m, 0.0)
+        middle = _level_pose((low_x + high_x) / 2, (low_y + high_y) / 2, self.floor_m, 0.0)
         return Scene([*bodies, Body.plane((high_x - low_x + _FLOOR_M, high_y - low_y + _FLOOR_M), pose=middle)])
 
     def with_walls_moved(self, displacement_m: _Float) -> Self:
