@@ -19,7 +19,7 @@ from phasemark import UsageError
 from phasemark.data.progress import Progress, counter
 from phasemark.matcher.calibration.judgement import cause_of_refusal, doubts_about, likely_cause
 from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
-from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, Mounting, check_names
+from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, Mounting, check_names
 from phasemark.matcher.calibration.pose_frames import Explained
 from phasemark.matcher.calibration.problem import AstrayError, Problem
 from phasemark.matcher.calibration.recording_fit import solve_recording
@@ -224,19 +224,19 @@ def _names(
 ) -> tuple[str, ...]:
     """Return the names of the free parameters; refuse those that these frames cannot tell."""
     lens = sensor.lens
-    names = (MOUNTING_NAMES if moving else NAMES) if free is None else check_names(free, "'free'", lens)
+    floor = background is not None and background.estimates_floor_albedo
+    told = {"delay": moving, "floor_albedo": floor}
+    usual = tuple(name for name in MOUNTING_NAMES if told.get(name, True))
+    names = usual if free is None else check_names(free, "'free'", lens)
     if "delay" in names and not moving:
         raise UsageError("the delay takes a moving camera: give moving=True, and time stamps of frames and poses")
-    floor_is_free = background is not None and background.estimates_floor_albedo
-    if free is not None and "floor_albedo" in names and not floor_is_free:
+    if "floor_albedo" in names and not floor:
         raise UsageError("the albedo of the floor takes bounces and a positive floor_albedo_std of the background")
     if recorded and free is not None and "albedo" in names:
         raise UsageError("the albedo cannot be free for a moving camera or with offsets of zones: give fixed=albedo")
     left = {*check_names(fixed, "'fixed'", lens), *(() if lens is None else HALF_ANGLES)}
     if recorded or (free is None and not lit):
         left.add("albedo")
-    if not floor_is_free:
-        left.add("floor_albedo")
     names = tuple(name for name in names if name not in left)
     if not names:
         raise UsageError("nothing is free: there is nothing to calibrate")

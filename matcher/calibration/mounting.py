@@ -94,8 +94,8 @@ ALL_NAMES = tuple(PARAMETERS)
 MOUNTING_NAMES = tuple(name for name in ALL_NAMES if name not in TERMS)
 """All but the terms of a lens, which follow in the vector."""
 HALF_ANGLES = ("half_angle_h", "half_angle_v")
-NAMES = tuple(name for name in MOUNTING_NAMES if name != "delay")
-"""What frames from still poses can tell; the delay takes a moving camera."""
+NAMES = tuple(name for name in MOUNTING_NAMES if name not in ("delay", "floor_albedo"))
+"""What frames from still poses can tell where no light bounces; the delay takes a moving camera."""
 _RELATIVE = (*HALF_ANGLES, "fx", "fy")
 """What has a prior relative to its assumed value."""
 
