@@ -1,6 +1,7 @@
 """A tilted robot among walls: zones against rays, their slopes, height, pitch and roll with their covariance."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from phasemark.cli import main
 from phasemark.matcher.locate import Locator, Rig, WallMap, read_rig_recording
 from phasemark.matcher.locate.kernel_arguments import Scan
 from phasemark.matcher.locate.simulated import recording_bytes, simulated_recording
+from phasemark.matcher.locate.smoothing import smoothed
 from phasemark.matcher.locate.zones_in_space import SpaceModel
 
 BOX = {"x_m": 2.2, "y_m": 0.9, "yaw_deg": 20, "size_m": [0.4, 0.3, 0.45]}
@@ -225,3 +227,17 @@ def test_parts_of_a_recording_keep_its_rows(tmp_path):
     wide = ring_rig(2, reduction={"rows": [0, 9]})
     with pytest.raises(InputFileError, match=r"zones.npz: 'reduction.rows' of the rig must be within its 8 rows"):
         read_rig_recording(tmp_path / "zones.npz", wide)
+
+
+def test_a_stop_that_smoothing_locates_again_keeps_its_tilt():
+    one, rig = room(box=[BOX]), ring_rig(4)
+    truth = np.array([[1.0, 0.8, 0.3, 0.5, 0.05, -0.04], [1.2, 0.9, 0.4, 0.5, 0.05, -0.04]])
+    recording = simulated_recording(one, rig, truth, np.random.default_rng(2))
+    locator = Locator(one, rig, with_tilt=True)
+    first, second = locator.follow(recording)
+    assert first.accepted
+    lost = replace(second, accepted=False, reason="ambiguous", tilt=None)
+    again = smoothed(recording, [first, lost], locator)[1]
+    assert again.accepted
+    values, covariance = again.tilt
+    assert (np.abs(values - truth[1, 3:]) < 4 * np.sqrt(np.diag(covariance))).all()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from phasemark.matcher.calibration.known_poses import POSE_UNITS, KnownPoses
-from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, PARAMETERS, Mounting
+from phasemark.matcher.calibration.mounting import HALF_ANGLES, MOUNTING_NAMES, NAMES, PARAMETERS, Mounting
 from phasemark.matcher.calibration.problem import Fitted, Solution, rms
 from phasemark.matcher.calibration.recording_effects import own_title
 from phasemark.matcher.likelihood.residuals import ResidualKind
@@ -229,8 +229,8 @@ class Calibration(Fitted):
 
 def shown_names(found: Calibration) -> tuple[str, ...]:
     """Return the names of the numbers to show: half angles or a lens, a delay and a floor where they were estimated."""
-    left = {"delay"} if not found.mounting.delay_s else set[str]()
-    names = tuple(name for name in MOUNTING_NAMES if name in found.free or name not in left | {"floor_albedo"})
+    shown = {*NAMES, *found.free, *(["delay"] if found.mounting.delay_s else [])}
+    names = tuple(name for name in MOUNTING_NAMES if name in shown)
     if found.mounting.lens is None:
         return names
     return (*(name for name in names if name not in HALF_ANGLES), *found.mounting.lens.terms)

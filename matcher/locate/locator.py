@@ -274,13 +274,13 @@ class Locator:
 
     def _located(self, recording: RigRecording, k: int, prior: tuple[_Float, _Float] | None) -> LocatedPose:
         """Locate one stop; `prior`: mean and covariance."""
-        answer = self.locate_scan(recording.scan(k), prior, self._zones(recording, k))
+        answer = self.locate_scan(recording.scan(k), prior, self.zones(recording, k))
         note = recording.notes[k] if recording.notes else ""
         if "odometry jumps" in note:
             answer = replace(answer, accepted=False, reason="odometry jumps")
         return replace(answer, key=recording.key(k), note=note)
 
-    def _zones(self, recording: RigRecording, k: int) -> tuple[SpaceModel, Scan] | None:
+    def zones(self, recording: RigRecording, k: int) -> tuple[SpaceModel, Scan] | None:
         """Return the zones of a stop and the model of them; None where no tilt is asked for."""
         if not self.with_tilt:
             return None

@@ -62,7 +62,8 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
         for k, pose, around in zip(own[~used], poses[~used], covariance[~used], strict=True):
             if found[k].reason in ("ambiguous", "poor fit"):
-                again = locator.locate_scan(recording.scan(int(k)), (pose, around + part))
+                zones = locator.zones(recording, int(k))
+                again = locator.locate_scan(recording.scan(int(k)), (pose, around + part), zones)
                 if again.accepted:
                     found[k] = replace(again, key=found[k].key, note=found[k].note)
         used |= [found[k].accepted and bool(u or answers[k].reason) for k, u in zip(own.tolist(), used, strict=True)]

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.locate.kernel_arguments import Prediction, Scan
-from phasemark.matcher.locate.rig import Rig
 from phasemark.matcher.locate.scan_fit import StopModel
 from phasemark.matcher.locate.scan_rows import AGE, N_BODY, N_ROWS, N_TILT, SENSOR_YAW
 from phasemark.matcher.locate.wall_map import WallMap
@@ -145,7 +144,7 @@ class SpaceModel(StopModel):
         """Return camera2world, (F, S, 4, 4), and each camera's six motions by each unknown, (F, S, 6, p)."""
         step = 1e-6
         nudged = step * np.eye(len(theta))
-        poses = _camera_poses(np.vstack([theta, theta + nudged, theta - nudged]), scan, self.rig, self)
+        poses = _camera_poses(np.vstack([theta, theta + nudged, theta - nudged]), scan, self)
         here, plus, minus = poses[0], poses[1 : len(theta) + 1], poses[len(theta) + 1 :]
         back = np.swapaxes(here[..., :3, :3], -1, -2)
         moved = back @ (plus[..., :3, :] - minus[..., :3, :]) / (2 * step)
@@ -177,9 +176,9 @@ def _turns(yaw_rad: _Float, pitch_rad: _Float, roll_rad: _Float) -> _Float:
     return np.asarray(about @ tilt2level(pitch_rad, roll_rad))
 
 
-def _camera_poses(theta: _Float, scan: Scan, rig: Rig, model: SpaceModel) -> _Float:
+def _camera_poses(theta: _Float, scan: Scan, model: SpaceModel) -> _Float:
     """Return camera2world for each of (m, p) unknowns, (m, F, S, 4, 4)."""
-    numbers, sensors = model.numbers, len(rig.sensor)
+    rig, numbers, sensors = model.rig, model.numbers, len(model.rig.sensor)
     drift, age = theta[:, None, None, 3:5], theta[:, None, None, AGE]
     when = scan.time_s[:, None] - numbers.delay_s - age
     moved = np.stack(
