@@ -246,6 +246,17 @@ def test_a_wall_is_estimated_behind_a_landmark_beside_the_middle():
     assert np.degrees(match.bearing_rad) == pytest.approx(3.0, abs=0.3)
 
 
+def test_frames_that_all_their_pixels_explain_are_left_to_no_further_search(panel):
+    """Two doubtful frames of one batch, both explained before the cells of the bank are descended in."""
+    rng = np.random.default_rng(5)
+    distance, delta = rng.uniform(0.8, 1.2, 40), np.radians(rng.uniform(15, 25, 40))
+    frames = frames_of(panel, distance, delta, seed=5, background=Background(wall_m=2.5))[[3, 37]]
+    fixed = ("distance_m", "delta_rad")
+    together = Matcher(panel, "refine", free=fixed, background="auto", workers=1).match(frames)
+    assert together.accepted.all()
+    assert np.abs(together.distance_m - distance[[3, 37]]).max() < 0.03
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("n_frames", [1, 10])
 @pytest.mark.parametrize("setting", SETTINGS)

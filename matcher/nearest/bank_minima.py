@@ -168,7 +168,7 @@ class Search:
 
     def of_frames(self, frame: NDArray[np.int64]) -> Search:
         """Return the search for some of the frames."""
-        some = self.before(*(self._of_each[k] for k in frame)) if self._of_each else self
+        some = self.before(*(self._of_each[k] for k in frame)) if self._of_each and len(frame) else self
         return some if self._tilt_rad is None else some.tilted(self._tilt_rad[frame])
 
     def cells_of(self, frame: int) -> CellBounds:
