@@ -34,7 +34,7 @@ def test_a_dask_cluster_makes_the_same_bytes(reference, tmp_path):
 
 @pytest.mark.soak
 def test_a_dask_cluster_whose_workers_are_killed_every_2_s_makes_the_same_bytes(tmp_path):
-    views = 12_000
+    views = 30_000
     build_frames(PLAN.model_copy(update={"views": views}), tmp_path / "reference.h5").close()
     killed = dask_build(tmp_path / "frames.h5", views, 2)
     assert killed >= 3
