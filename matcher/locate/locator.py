@@ -17,7 +17,7 @@ from phasemark.matcher.locate.plane import difference, relative_pose
 from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.matcher.locate.rig import Rig
-from phasemark.matcher.locate.scan_fit import StopFit, StopModel, along_profiles, fit_stop, std_without_one
+from phasemark.matcher.locate.scan_fit import WIDTHS, StopFit, StopModel, along_profiles, fit_stop, std_without_one
 from phasemark.matcher.locate.wall_map import WallMap
 from phasemark.matcher.locate.zones_in_space import SpaceModel
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
@@ -28,6 +28,8 @@ LocateReason = Literal["", "no zones", "odometry jumps", "poor fit", "undetermin
 _SAME_FRAMES = 3
 """Frames of a stop that count as one opinion: what the map has wrong is wrong in all of them, and in all rows."""
 _MOST_STARTS, _MOST_REFINED = 32, 12
+_NARROW = 2.0, 1.0
+"""Noise of the rounds of a descent from near a pose, in that of the rig."""
 _HOPELESS = 4 * DISAGREEMENT
 """Cost by which a start may exceed the best one after a descent on three frames."""
 _REACH_SIGMA = 3.5
@@ -319,7 +321,7 @@ class Locator:
         model, given, fits = self.model, _given(prior), self._fits(scan, prior)
         if zones is not None:
             model, scan = zones
-            fits = self._distinct([fit_stop(model, scan, fit.theta, given, (2.0, 1.0)) for fit in fits])
+            fits = self._distinct([fit_stop(model, scan, fit.theta, given, _NARROW) for fit in fits])
         if not fits:
             return LocatedPose(("", 0, 0), observed=observed, reason="poor fit")
         if zones is None:
@@ -335,10 +337,12 @@ class Locator:
         starts = promising_poses(self._grid, self.model.numbers, thin, _MOST_STARTS, around)
         if prior is not None:
             starts = np.vstack([prior[0], starts])
-        fits = self._distinct([fit_stop(self.model, thin, pose, given) for pose in starts])
+        # noise that is wide at first leads out of small basins, and past the right one
+        ways = [(pose, widths) for pose in starts for widths in (WIDTHS, _NARROW)]
+        fits = self._distinct([fit_stop(self.model, thin, pose, given, widths) for pose, widths in ways])
         fits = [fit for fit in fits if fit.cost < fits[0].cost + _HOPELESS][:_MOST_REFINED]
         if len(scan.time_s) > len(few):
-            fits = self._distinct([fit_stop(self.model, scan, fit.theta, given, (2.0, 1.0)) for fit in fits])
+            fits = self._distinct([fit_stop(self.model, scan, fit.theta, given, _NARROW) for fit in fits])
         return fits
 
     def _distinct(self, fits: list[StopFit]) -> list[StopFit]:

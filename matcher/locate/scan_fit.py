@@ -17,7 +17,7 @@ from phasemark.matcher.locate.scan_rows import N_BODY, N_ROWS, SENSOR_YAW, empty
 
 _Float = NDArray[np.float64]
 
-_WIDTHS = (8.0, 3.0, 1.0)
+WIDTHS = (8.0, 3.0, 1.0)
 """Noise of the rounds of a descent, in that of the rig: a start may be off by more than a wall's noise."""
 _MOST_STEPS, _MOST_ROUNDS = 12, 8
 _DONE = 1e-3
@@ -148,7 +148,7 @@ def fit_stop(
     scan: Scan,
     start: _Float,
     prior: tuple[_Float, _Float] | None = None,
-    widths: tuple[float, ...] = _WIDTHS,
+    widths: tuple[float, ...] = WIDTHS,
 ) -> StopFit:
     """Descend from a start to a pose that explains a stop.
 
@@ -210,8 +210,8 @@ def std_without_one(model: StopModel, scan: Scan, fit: StopFit) -> _Float:
 def along_profiles(model: StopModel, scan: Scan, fit: StopFit, prior: tuple[_Float, _Float] | None) -> StopFit:
     """Return a fit whose pose is as uncertain as the likelihood is: where walls end in columns, slopes do not hold.
 
-    Along each principal axis of the pose's covariance the variance is that of the likelihood's profile if that is
-    larger; the other unknowns follow linearly. Parameters as for :func:`fit_stop`.
+    Where the likelihood's profile along a principal axis of the pose's covariance is wider than that, the pose there is
+    the mean of the profile, with its variance; the other unknowns follow linearly. Parameters as for :func:`fit_stop`.
     """
     own = fit.covariance[:3, :3]
     if not np.isfinite(own).all():
@@ -221,15 +221,18 @@ def along_profiles(model: StopModel, scan: Scan, fit: StopFit, prior: tuple[_Flo
     values, axes = np.linalg.eigh(own / np.outer(root, root))
     axes = root[:, None] * axes * np.sqrt(values)
     ways = fit.covariance[:, :3] @ np.linalg.solve(own, axes)
-    around, variance = _priors(model, prior), np.ones(3)
+    around, variance, theta = _priors(model, prior), np.ones(3), fit.theta.copy()
     for k, way in enumerate(ways.T):
         cost = np.array([_cost(_Point(model, scan, fit.theta + by * way, around)) for by in at])
         weight = np.exp(-0.5 * (cost - cost.min()))
         mean = np.average(at, weights=weight)
-        variance[k] = max(1.0, np.average((at - mean) ** 2, weights=weight))
+        spread = np.average((at - mean) ** 2, weights=weight)
+        if spread > 1.0:
+            variance[k] = spread
+            theta += mean * way
     covariance = fit.covariance.copy()
     covariance[:3, :3] = axes * variance @ axes.T
-    return replace(fit, covariance=covariance)
+    return replace(fit, theta=theta, covariance=covariance)
 
 
 def _cost(point: _Point) -> float:
