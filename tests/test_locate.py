@@ -15,7 +15,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.cli import main
 from phasemark.matcher.locate import Locator, Rig, WallMap, read_rig, read_rig_recording, read_wall_map
 from phasemark.matcher.locate.kernel_arguments import Scan
-from phasemark.matcher.locate.scan_fit import StopModel
+from phasemark.matcher.locate.scan_fit import StopModel, fit_stop
 from phasemark.matcher.locate.scan_rows import SENSOR_YAW
 from phasemark.matcher.locate.simulated import recording_bytes, simulated_recording
 from phasemark.matcher.locate.smoothing import smoothed
@@ -110,12 +110,37 @@ def test_poses_of_random_rooms_have_the_covariance_that_is_stated():
 
 
 @pytest.mark.soak
-def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated():
-    nees, wrong, accepted, n, seen = trials(maps=20, stops=250, seed=6)
+@pytest.mark.parametrize("seed", [6, 7, 8])
+def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated(seed):
+    nees, wrong, accepted, n, seen = trials(maps=20, stops=250, seed=seed)
     assert wrong == 0
-    assert accepted > 0.9 * seen > 0.6 * n
+    assert accepted > 0.9 * seen > 0.5 * n
     # of some 3500 accepted 0.014 is one standard deviation; columns at the ends of walls are not linear, some per cent
-    assert 0.95 < nees.mean() / 3 < 1.08
+    assert 0.95 < nees.mean() / 3 < 1.05
+
+
+def test_a_start_is_not_led_past_the_right_basin():
+    rng = np.random.default_rng(7)
+    for _ in range(15):
+        one, rig, poses, recording, start, std = drawn_stops(250, rng)
+    k, wrong_basin_costs = 185, 30  # there columns cost this much more, 12 cm off, where a descent with wide noise ends
+    model, given = StopModel(rig, one.outline(), rig.numbers()), (start[k], np.diag(std**-2.0))
+    scan = recording.scan(k)
+    led, near = (fit_stop(model, scan, begin, given) for begin in (start[k], poses[k]))
+    narrow = fit_stop(model, scan, poses[k], given, (1.0,))
+    assert min(led.cost, near.cost) > narrow.cost + wrong_basin_costs
+    answer = Locator(one, rig).locate_scan(scan, (start[k], np.diag(std**2)))
+    assert_allclose(answer.pose, poses[k], atol=0.04)
+
+
+def drawn_stops(stops, rng):
+    """Map, rig of 1 … 8 sensors, poses, their recording, starts and the standard deviations of these."""
+    one = random_room(rng)
+    rig = ring_rig(int(rng.integers(1, 9)), noise={"outliers": 0.02})
+    poses = free_poses(one, stops, rng)
+    recording = simulated_recording(one, rig, poses, rng)
+    std = np.array([0.2, 0.2, 0.09])
+    return one, rig, poses, recording, poses + std * rng.standard_normal(poses.shape), std
 
 
 def trials(maps, stops, seed):
@@ -125,15 +150,9 @@ def trials(maps, stops, seed):
     """
     rng, nees, wrong, seen = np.random.default_rng(seed), [], 0, 0
     for _ in range(maps):
-        one = random_room(rng)
-        rig = ring_rig(int(rng.integers(1, 9)), noise={"outliers": 0.02})
+        one, rig, poses, recording, start, std = drawn_stops(stops, rng)
         seen += stops * (len(rig.sensor) > 2)
-        poses = free_poses(one, stops, rng)
-        recording = simulated_recording(one, rig, poses, rng)
-        std = np.array([0.2, 0.2, 0.09])
-        for answer, pose in zip(
-            Locator(one, rig).locate(recording, poses + std * rng.standard_normal(poses.shape), std), poses, strict=True
-        ):
+        for answer, pose in zip(Locator(one, rig).locate(recording, start, std), poses, strict=True):
             off = answer.pose - pose
             off[2] = math.remainder(off[2], math.tau)
             if answer.accepted:
