@@ -65,8 +65,10 @@ surface each, that an answer explains beyond its number of free parameters."""
 _WALL_MOVES_M = 0.1
 """By how much a wall may be elsewhere than is expected of a frame that is tracked."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
-_PIXELS_AT_ONCE = 1 << 20
-"""Of all frames that are matched together. Each takes up to a kilobyte, for every candidate has an image of it."""
+_PIXELS_AT_ONCE = 1 << 22
+"""Of all frames that are matched together, times the square of the number of free parameters: every candidate has an
+image of each pixel with its slopes, and there are more candidates the more parameters are free. A pixel takes up to a
+kilobyte with two free parameters, and some fifteen with six."""
 
 
 class LikelihoodMatcher:
@@ -213,7 +215,8 @@ class LikelihoodMatcher:
     def _parts(self, which: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """Return frames in parts that are matched at once."""
         share = max(math.ceil(len(which) / self._workers), 1)
-        share = min(share, self._setup.policy.frames_at_once, max(_PIXELS_AT_ONCE // self._setup.used.size, 1))
+        most = _PIXELS_AT_ONCE // (self._setup.used.size * len(self.free) ** 2)
+        share = min(share, self._setup.policy.frames_at_once, max(most, 1))
         return [which[start : start + share] for start in range(0, len(which), share)]
 
     def _match_stated(self, frames: FilteredFrames) -> list[Match]:
