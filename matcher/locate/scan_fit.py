@@ -230,6 +230,7 @@ def along_profiles(model: StopModel, scan: Scan, fit: StopFit, prior: tuple[_Flo
         if spread > 1.0:
             variance[k] = spread
             theta += mean * way
+    theta[2] = math.remainder(theta[2], math.tau)
     covariance = fit.covariance.copy()
     covariance[:3, :3] = axes * variance @ axes.T
     return replace(fit, theta=theta, covariance=covariance)
