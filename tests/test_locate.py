@@ -110,11 +110,11 @@ def test_poses_of_random_rooms_have_the_covariance_that_is_stated():
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("seed", [6, 7, 8])
-def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated(seed):
+@pytest.mark.parametrize(("seed", "least"), [(6, 0.6), (7, 0.58), (8, 0.53)])  # some rigs have one or two sensors
+def test_poses_of_many_random_rooms_have_the_covariance_that_is_stated(seed, least):
     nees, wrong, accepted, n, seen = trials(maps=20, stops=250, seed=seed)
     assert wrong == 0
-    assert accepted > 0.9 * seen > 0.5 * n
+    assert accepted > 0.9 * seen > least * n
     # of some 3500 accepted 0.014 is one standard deviation; columns at the ends of walls are not linear, some per cent
     assert 0.95 < nees.mean() / 3 < 1.05
 
