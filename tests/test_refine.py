@@ -360,7 +360,7 @@ def test_fewer_frames_are_matched_together_where_images_are_large(bank, renderer
     matcher = LikelihoodMatcher(bank, free=VIEW[:2], workers=1)
     expected, sizes, match = matcher.match(frames), [], matcher._match_stated
     monkeypatch.setattr(matcher, "_match_stated", lambda part: sizes.append(len(part)) or match(part))
-    monkeypatch.setattr("phasemark.matcher.likelihood.likelihood_matcher._PIXELS_AT_ONCE", 2 * 256 + 1)
+    monkeypatch.setattr("phasemark.matcher.likelihood.likelihood_matcher._PIXELS_AT_ONCE", 2 * 256 * 2**2 + 1)
     found = matcher.match(frames)
     assert sizes == [2, 2, 1]
     assert [match.distance_m for match in found] == pytest.approx([match.distance_m for match in expected], abs=1e-9)
