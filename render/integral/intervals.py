@@ -19,7 +19,7 @@ from phasemark.render.kernel import kernel
 
 EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
-_TRIFLE = 4e-5
+_TRIFLE = 4e-6
 """Area times squared extent, in those of the box, under which a piece gets one line."""
 _STRIP, _LIMB_STRIP = 0.6, 0.25
 """Largest extent, in sides of the box, of a piece with one Gauss rule: in general, and where a limb runs across it."""

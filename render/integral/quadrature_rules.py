@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phasemark.render.kernel import kernel
 
-_THIN = 0.15
+_THIN = 0.07
 """Intervals narrower than this share of their box get one Gauss point."""
 _BESIDE_LIMB = (0.1, 0.6)
 """Intervals beside a limb get two Gauss points, or three, or four where they are wider than this (pixels)."""
