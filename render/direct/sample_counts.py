@@ -26,28 +26,25 @@ from phasemark.render.direct.footprints import (
 from phasemark.render.direct.transients import PARTS, through_lens
 from phasemark.render.integral.scene_samples import FLOOR, WALL, SceneSamples
 from phasemark.render.kernel import kernel
+from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
 _ALL_PARTS = FLOOR + 1
 
 
 class _Response(NamedTuple):
-    """The cumulative response of each zone on a fine axis of delays, and where bins begin.
+    """How light is shared among bins, for places of the earliest of them relative to its range.
 
     Parameters
     ----------
-    share : (zones or 1, m) float64
-        0 … 1 along the delays.
-    first_m, steps_per_m : float
-        First delay and density of the axis.
-    start_m, width_m : (zones,) float64
-        Range of the lower edge of bin 0, delays of the zone taken off, and width of the bins.
+    share : (zones or 1, phases + 1, taps) float64
+        Of the earliest bin that light reaches and those after it, for begins of the response 0 … 1 bins into that bin.
+    begin_m, width_m : (zones,) float64
+        Range whose response begins at the lower edge of bin 0, delays of the zone taken off, and width of the bins.
     """
 
     share: NDArray[np.float64]
-    first_m: float
-    steps_per_m: float
-    start_m: NDArray[np.float64]
+    begin_m: NDArray[np.float64]
     width_m: NDArray[np.float64]
 
 
@@ -142,7 +139,7 @@ def _signals(
     out = np.zeros((samples.n_views, n_places, n_zones, histogram.bins))
     response = optics.response
     # zones of one response are lit alike by stray light, which is then added to their counts in the end
-    alike = len(response.share) == 1 and np.ptp(response.start_m) == 0 and np.ptp(response.width_m) == 0
+    alike = len(response.share) == 1 and np.ptp(response.begin_m) == 0
     stray = 0.0 if alike else histogram.stray
     _add_samples(through_lens(samples, sensor), albedos, place, optics, sensor.cols, stray, out, shares)
     if alike and histogram.stray > 0:
@@ -156,6 +153,18 @@ def _optics_of(sensor: Sensor) -> _Optics:
     """Return footprints and responses of a sensor as the kernel takes them."""
     histogram, zones = histogram_of(sensor), footprints_of(sensor)
     n_zones = sensor.rows * sensor.cols
+    offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
+    width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale").ravel()
+    begin_m = histogram.start_m - offset - histogram.irf_reach_m[0]
+    alike = len(histogram.irf) <= 1 and np.ptp(width_m) == 0
+    share = np.stack([_shares(histogram, zone, width_m[zone]) for zone in range(1 if alike else n_zones)])
+    response = _Response(share, begin_m, width_m)
+    scale = sensor.zone_values("zone_gain").ravel() / footprint_areas(zones)
+    return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
+
+
+def _shares(histogram: Histogram, zone: int, width_m: float) -> NDArray[np.float64]:
+    """Return the shares of bins of a width, (phases + 1, taps); see :class:`_Response`."""
     low, high = histogram.irf_reach_m
     if histogram.irf_std_m is not None:
         steps_per_std = 64
@@ -163,44 +172,22 @@ def _optics_of(sensor: Sensor) -> _Optics:
     else:
         steps_per_sample = 32
         step = (high - low) / ((len(histogram.irf[0]) - 1) * steps_per_sample)
-    delay = low + step * np.arange(int(np.ceil((high - low) / step)) + 1)
-    alike = len(histogram.irf) <= 1
-    share = np.stack([response_share(delay, histogram, zone) for zone in range(1 if alike else n_zones)])
-    offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
-    width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale").ravel()
-    response = _Response(share, float(low), 1 / step, histogram.start_m - offset, width_m)
-    scale = sensor.zone_values("zone_gain").ravel() / footprint_areas(zones)
-    return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
-
-
-@kernel
-def _share(table, x):  # type: ignore[no-untyped-def]
-    """Return the cumulative response at a place along its axis, linear between two steps."""
-    if x <= 0.0:
-        return 0.0
-    i = int(x)
-    if i >= len(table) - 1:
-        return 1.0
-    return table[i] + (x - i) * (table[i + 1] - table[i])
+    taps = math.ceil((high - low) / width_m) + 1
+    phase = np.linspace(0.0, 1.0, math.ceil(width_m / step) + 1)
+    return np.diff(response_share(low + (np.arange(taps + 1) - phase[:, None]) * width_m, histogram, zone), axis=1)
 
 
 @kernel
 def _add_to_bins(light, range_m, response, zone, out):  # type: ignore[no-untyped-def]
-    """Share light from one range among the bins of a zone."""
-    table = response.share[min(zone, len(response.share) - 1)]
-    first, density, width_m = response.first_m, response.steps_per_m, response.width_m[zone]
-    nearest = range_m - response.start_m[zone]
-    j = max(math.floor((nearest + first) / width_m), 0)
-    stop = min(math.ceil((nearest + first + (len(table) - 1) / density) / width_m), len(out))
-    x = (j * width_m - nearest - first) * density
-    step = width_m * density
-    below = _share(table, x)
-    while j < stop:
-        x += step
-        above = _share(table, x)
-        out[j] += light * (above - below)
-        below = above
-        j += 1
+    """Share light from one range among the bins of a zone, linearly between two phases."""
+    share = response.share[min(zone, len(response.share) - 1)]
+    place = (range_m - response.begin_m[zone]) / response.width_m[zone]
+    earliest = math.floor(place)
+    x = (place - earliest) * (share.shape[0] - 1)
+    i = min(int(x), share.shape[0] - 2)
+    before, after, f = share[i], share[i + 1], x - i
+    for k in range(max(-earliest, 0), min(len(out) - earliest, share.shape[1])):
+        out[earliest + k] += light * (before[k] + f * (after[k] - before[k]))
 
 
 @kernel
