@@ -68,6 +68,7 @@ class Buffers:
     n_links: int = 1 << 14
     n_borders: int = 0
     n_parameters: int = 0
+    n_parts: int = 0
     keeps_pieces: bool = False
 
     def __post_init__(self) -> None:
@@ -86,6 +87,7 @@ class Buffers:
             ends=np.empty((self.n_segments, 2), np.int32),
             extent=np.empty((2, 4)),
             line=np.empty(4),
+            near=np.empty(self.n_parts, np.int32),
         )
         self.samples = _room_for(self.n_samples, self.keeps_pieces)
         self.borders = _room_for_borders(self.n_borders, self.n_parameters)
@@ -273,6 +275,7 @@ class AreaIntegral:
             (camera.rows, camera.cols),
             n_borders=0 if slopes is None else _BORDERS,
             n_parameters=0 if slopes is None else len(slopes.turns),
+            n_parts=len(mesh.parts),
         )
         for task in tasks:
             poses, own = of_poses(every, task), _of_views(sums, task)

@@ -165,6 +165,8 @@ class Edges(NamedTuple):
         Scratch: an edge in tangents.
     arc, points : (3, 3), (2, 3) float64
         Scratch: the ellipse of a round edge, and the ends of a segment of it.
+    near : (parts,) int32
+        Scratch: convex parts that may hide an edge.
     """
 
     segments: NDArray[np.float64]
@@ -178,6 +180,7 @@ class Edges(NamedTuple):
     line: NDArray[np.float64]
     arc: NDArray[np.float64]
     points: NDArray[np.float64]
+    near: NDArray[np.int32]
 
 
 class Borders(NamedTuple):

@@ -15,10 +15,12 @@ from phasemark.render.kernel import kernel
 _BEHIND = 0.01
 """Share of its way to the lens by which a point must lie behind a part to be hidden by it: edges that end at another
 body reach a little into it, for its own edges are chains."""
+_BUNDLE = 32
+"""Neighbouring rays for which the parts that any of them may meet are listed once."""
 
 
 @kernel
-def enter_parts(mesh, origins, directions, found, distance):  # type: ignore[no-untyped-def]
+def enter_parts(mesh, origins, directions, near, found, distance):  # type: ignore[no-untyped-def]
     """Replace the faces that rays met by those of convex parts that are nearer along them.
 
     Parameters
@@ -26,28 +28,85 @@ def enter_parts(mesh, origins, directions, found, distance):  # type: ignore[no-
     mesh : MeshTopology
         Its ``parts`` are asked.
     origins, directions : (n, 3) float32
+        Neighbours of one origin, with directions of about the same length, take the least time.
+    near : (parts,) int32, scratch
     found : (n,) int32, overwritten
     distance : (n,) float64, overwritten
         In lengths of the directions.
     """
-    for i in range(len(origins)):
-        ox, oy, oz = float(origins[i, 0]), float(origins[i, 1]), float(origins[i, 2])
-        dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
-        for part in range(len(mesh.parts)):
-            if _passes(mesh.balls[part], ox, oy, oz, dx, dy, dz):
-                continue
-            enters, face = _enter(mesh, part, ox, oy, oz, dx, dy, dz)
-            if enters < distance[i]:
-                found[i], distance[i] = face, enters
+    start = 0
+    while start < len(origins):
+        ox, oy, oz = float(origins[start, 0]), float(origins[start, 1]), float(origins[start, 2])
+        stop, x, y, z = start, 0.0, 0.0, 0.0
+        while stop < min(start + _BUNDLE, len(origins)) and ox == origins[stop, 0] and oy == origins[stop, 1]:
+            if oz != origins[stop, 2]:
+                break
+            x, y, z = x + directions[stop, 0], y + directions[stop, 1], z + directions[stop, 2]
+            stop += 1
+        x, y, z, square = x / (stop - start), y / (stop - start), z / (stop - start), 0.0
+        for i in range(start, stop):
+            dx, dy, dz = directions[i, 0] - x, directions[i, 1] - y, directions[i, 2] - z
+            square = max(square, dx * dx + dy * dy + dz * dz)
+        count = list_parts(mesh, ox, oy, oz, x, y, z, math.sqrt(square), np.inf, near)
+        for i in range(start, stop):
+            dx, dy, dz = float(directions[i, 0]), float(directions[i, 1]), float(directions[i, 2])
+            for k in range(count):
+                part = near[k]
+                if _passes(mesh.balls[part], ox, oy, oz, dx, dy, dz):
+                    continue
+                enters, face = _enter(mesh, part, ox, oy, oz, dx, dy, dz)
+                if enters < distance[i]:
+                    found[i], distance[i] = face, enters
+        start = stop
 
 
 @kernel
-def is_hidden(mesh, lens, a, b, body, other):  # type: ignore[no-untyped-def]
-    """Return whether one convex part, not of the two bodies that an edge belongs to, hides both of its ends."""
+def list_parts(mesh, ox, oy, oz, x, y, z, radius, farthest, near):  # type: ignore[no-untyped-def]
+    """List the parts that may lie on a ray from a point through a ball.
+
+    Parameters
+    ----------
+    mesh : MeshTopology
+    ox, oy, oz : float
+        The point.
+    x, y, z, radius : float
+        From the point to the middle of the ball, and its radius.
+    farthest : float
+        Parts that begin farther from the point are left out.
+    near : (parts,) int32, overwritten
+
+    Returns
+    -------
+    int
+        How many parts are listed, in the order of their numbers.
+    """
+    away = x * x + y * y + z * z
+    outside = math.sqrt(max(away - radius * radius, 0.0))
+    away, count = math.sqrt(away), 0
+    for part in range(len(mesh.parts)):
+        ball = mesh.balls[part]
+        px, py, pz = ball[0] - ox, ball[1] - oy, ball[2] - oz
+        square = px * px + py * py + pz * pz
+        clear = square - ball[3] * ball[3]
+        # cos β ≥ cos (α + γ) of the angle β between the middles, and α and γ that the radii are seen under
+        slack = 1e-9 * away * math.sqrt(square)
+        seen = x * px + y * py + z * pz + slack >= outside * math.sqrt(max(clear, 0.0)) - radius * ball[3]
+        if (seen or radius >= away or clear <= 0.0) and square <= (farthest + ball[3]) * (farthest + ball[3]):
+            near[count] = part
+            count += 1
+    return count
+
+
+@kernel
+def is_hidden(mesh, lens, a, b, body, other, near):  # type: ignore[no-untyped-def]
+    """Return whether one convex part, not of the two bodies that an edge belongs to, hides both of its ends.
+
+    `near` are the numbers of the parts that may, see :func:`list_parts`.
+    """
     ox, oy, oz = lens[0], lens[1], lens[2]
     ax, ay, az = a[0] - ox, a[1] - oy, a[2] - oz
     bx, by, bz = b[0] - ox, b[1] - oy, b[2] - oz
-    for part in range(len(mesh.parts)):
+    for part in near:
         owner = mesh.part[mesh.parts[part, 0]]
         if owner == body or owner == other:
             continue

@@ -16,7 +16,7 @@ import math
 import numpy as np
 
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
-from phasemark.render.integral.convex_parts import is_hidden
+from phasemark.render.integral.convex_parts import is_hidden, list_parts
 from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, segments_of
 from phasemark.render.kernel import kernel
 
@@ -49,6 +49,8 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     lens, matrix, offset = poses.lens[view], poses.matrix[view], poses.offset[view]
     n, crease, limb = np.int64(0), np.int64(0), np.int64(1)
     start_extents(edges)
+    for part in range(len(mesh.parts)):
+        edges.near[part] = part
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
         # a closed shell hides what turns its back, and a valley from everywhere but between its slopes
@@ -58,7 +60,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
         body, beside = mesh.part[face], mesh.part[other if other >= 0 else face]
-        if len(mesh.parts) > 0 and is_hidden(mesh, lens, vertices[start], vertices[end], body, beside):
+        if is_hidden(mesh, lens, vertices[start], vertices[end], body, beside, edges.near):
             continue
         n = _add_edge(vertices, start, end, crease, matrix, offset, camera, edges, n)
         if n < 0:
@@ -99,6 +101,7 @@ def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ig
     begin, end = arc_of(curve, lens, arc)
     if begin == end:
         return n
+    near = edges.near[: _list_before(mesh, curve, lens, edges.near)]
     if curve[0] == TUBE:
         for angle in (begin, end):
             for k in range(3):
@@ -106,19 +109,31 @@ def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ig
                 edges.points[0, k] = arc[0, k] + across - curve[10 + k]
                 edges.points[1, k] = arc[0, k] + across + curve[10 + k]
             left = _turns_left(edges.points, arc, lens)
-            n = _add_segment(mesh, lens, curve[13], np.int64(1), left, matrix, offset, camera, edges, n)
+            n = _add_segment(mesh, lens, curve[13], np.int64(1), left, near, matrix, offset, camera, edges, n)
             if n < 0:
                 return FULL
         return n
-    n = _add_arc(mesh, begin, end, curve[13], curve[0] >= BALL, lens, matrix, offset, camera, edges, n)
+    n = _add_arc(mesh, begin, end, curve[13], curve[0] >= BALL, lens, near, matrix, offset, camera, edges, n)
     whole = 2.0 * math.pi
     if curve[0] == RIM and n >= 0 and end - begin < whole and before_rim(curve, lens):
-        n = _add_arc(mesh, end, begin + whole, curve[13], False, lens, matrix, offset, camera, edges, n)
+        n = _add_arc(mesh, end, begin + whole, curve[13], False, lens, near, matrix, offset, camera, edges, n)
     return n
 
 
 @kernel
-def _add_arc(mesh, begin, end, body, is_limb, lens, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+def _list_before(mesh, curve, lens, near):  # type: ignore[no-untyped-def]
+    """List the convex parts that may hide some of a round edge in `near`; return how many there are."""
+    square_u, square_v, square_w, away = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        square_u, square_v = square_u + curve[4 + k] ** 2, square_v + curve[7 + k] ** 2
+        square_w, away = square_w + curve[10 + k] ** 2, away + (curve[1 + k] - lens[k]) ** 2
+    radius = math.sqrt(max(square_u, square_v) + (square_w if curve[0] == TUBE else 0.0))
+    x, y, z = curve[1] - lens[0], curve[2] - lens[1], curve[3] - lens[2]
+    return list_parts(mesh, lens[0], lens[1], lens[2], x, y, z, radius, math.sqrt(away) + radius, near)
+
+
+@kernel
+def _add_arc(mesh, begin, end, body, is_limb, lens, near, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append an arc of the ellipse at hand as a chain that has its area and its ends."""
     arc, points = edges.arc, edges.points
     away, first, second = 0.0, 0.0, 0.0
@@ -141,7 +156,7 @@ def _add_arc(mesh, begin, end, body, is_limb, lens, matrix, offset, camera, edge
             continue
         if i == 1:
             left = _turns_left(points, arc, lens)
-        n = _add_segment(mesh, lens, body, np.int64(is_limb), left, matrix, offset, camera, edges, n)
+        n = _add_segment(mesh, lens, body, np.int64(is_limb), left, near, matrix, offset, camera, edges, n)
         if n < 0:
             return FULL
     return n
@@ -157,9 +172,9 @@ def _turns_left(points, arc, lens):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _add_segment(mesh, lens, body, limb, left, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
+def _add_segment(mesh, lens, body, limb, left, near, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append a segment of a round edge, whose surface is on its left or on its right."""
-    if is_hidden(mesh, lens, edges.points[0], edges.points[1], body, body):
+    if is_hidden(mesh, lens, edges.points[0], edges.points[1], body, body, near):
         return n
     spare = 2  # for the background, and for one more
     if n + spare > len(edges.segments):

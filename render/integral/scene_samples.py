@@ -180,7 +180,9 @@ class SceneMesh:
             buffers = idle.pop()
         except IndexError:  # every thread has scratch of its own
             n_edges = len(mesh.creases) + len(mesh.folds)
-            buffers = Buffers(n_edges, (rows, cols), n_samples=_SAMPLES, keeps_pieces=self._resolves)
+            buffers = Buffers(
+                n_edges, (rows, cols), n_samples=_SAMPLES, n_parts=len(mesh.parts), keeps_pieces=self._resolves
+            )
         behind = bool(background[:2].any())
         # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
         radians_per_scale = 1.5

@@ -318,7 +318,7 @@ class _NearestOf:
             if count:
                 faces = mover.intersector.first_face(own_origins[:count], own_directions[:count])
                 _keep_nearer(mesh.planes, mover.numbers, faces, rays, origins, directions, found, distance)
-        enter_parts(mesh, origins, directions, found, distance)
+        enter_parts(mesh, origins, directions, np.empty(len(mesh.parts), np.int32), found, distance)
         return found
 
 
