@@ -7,6 +7,7 @@ of the image and overlap its neighbours. Footprints are scaled so that each zone
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +72,7 @@ def histogram_of(sensor: Sensor) -> Histogram:
     return sensor.histogram
 
 
+@lru_cache(maxsize=16)
 def footprints_of(sensor: Sensor) -> Footprints:
     """Return the footprints of a sensor's zones."""
     histogram = histogram_of(sensor)
@@ -115,6 +117,7 @@ def _aligned(cells: int, scale: float) -> bool:
     return abs(border - round(border)) < _ALIGNED
 
 
+@lru_cache(maxsize=16)
 def footprint_grid(sensor: Sensor, margin_cells: int = 0, cells: int | None = None) -> Camera:
     """Return a camera whose pixels tile what the zones see: the grid on which the scene is integrated.
 

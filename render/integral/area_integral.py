@@ -13,26 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.integral.arguments import (
-    Borders,
-    Camera,
-    Edges,
-    Light,
-    Motion,
-    Pieces,
-    Poses,
-    Returns,
-    Samples,
-    Sums,
-)
+from phasemark.render.integral.arguments import Camera, Light, Motion, Poses, Samples, Sums
+from phasemark.render.integral.buffers import Buffers, Layout, lend_buffers, room_for_samples
 from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import Intersector
 from phasemark.render.integral.lens_tables import distortion_of
 from phasemark.render.integral.light import add_background, points_a_side, sum_samples
-from phasemark.render.integral.mesh_topology import CLUSTER, MeshTopology
-from phasemark.render.integral.pixel_splitting import Scratch
-from phasemark.render.integral.ray_plan import SHORT_LINKS, SHORT_SEGMENTS, plan_rays
+from phasemark.render.integral.mesh_topology import MeshTopology
+from phasemark.render.integral.ray_plan import plan_rays
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.integral.slopes import SlopeSums
 from phasemark.render.integral.surface_mesh import SurfaceMesh
@@ -47,106 +36,10 @@ from phasemark.render.view import Views
 Variant = Literal["exact", "hard"]
 """The area integral, or what the centre ray of each pixel sees."""
 
-_SAMPLES = 1 << 17
-_RETURNS = 1 << 9
-_BORDERS = 1 << 14
-_LINKS = 1 << 10
-"""Further segments that a view is given room for when edges become chains behind a lens with distortion."""
-
-
+_RAYS_AT_ONCE = 1 << 20
+"""A ray takes some hundred bytes."""
 NO_LEAST = np.empty((0, 0, 2), np.int64)
 """No pixel asks for more boxes than all."""
-
-
-@dataclass
-class Buffers:
-    """Scratch of one thread; grows when a view needs more."""
-
-    n_edges: int
-    shape: tuple[int, int]
-    n_samples: int = _SAMPLES
-    n_links: int = 1 << 14
-    n_borders: int = 0
-    n_parameters: int = 0
-    n_parts: int = 0
-    keeps_pieces: bool = False
-
-    def __post_init__(self) -> None:
-        rows, cols = self.shape
-        self.n_segments = self.n_edges + 1
-        self.scratch = Scratch.empty()
-        self.edges = Edges(
-            segments=np.empty((self.n_segments, 4)),
-            limb=np.empty(self.n_segments, np.int8),
-            head=np.empty((rows + 2, cols + 2), np.int32),
-            link=np.empty(self.n_links, np.int32),
-            owner=np.empty(self.n_links, np.int32),
-            heights=np.empty(CLUSTER),
-            arc=np.empty((3, 3)),
-            points=np.empty((2, 3)),
-            ends=np.empty((self.n_segments, 2), np.int32),
-            extent=np.empty((2, 4)),
-            line=np.empty(4),
-            near=np.empty(self.n_parts, np.int32),
-        )
-        self.samples = _room_for(self.n_samples, self.keeps_pieces)
-        self.borders = _room_for_borders(self.n_borders, self.n_parameters)
-
-    def make_room(self, reached: int) -> None:
-        """Grow what was too short, as :func:`plan_rays` says in place of the next view."""
-        if reached == SHORT_LINKS:
-            self._grow_links()
-        elif reached == SHORT_SEGMENTS:
-            self._grow_segments()
-        else:
-            self._grow_samples()
-
-    def _grow_segments(self) -> None:
-        n = self.n_segments = 2 * self.n_segments + _LINKS
-        self.edges = self.edges._replace(
-            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
-        )
-
-    def _grow_links(self) -> None:
-        n = 2 * len(self.edges.link)
-        self.edges = self.edges._replace(link=np.empty(n, np.int32), owner=np.empty(n, np.int32))
-
-    def _grow_samples(self) -> None:
-        self.samples = _room_for(2 * len(self.samples.weights), self.keeps_pieces)
-        self.borders = _room_for_borders(2 * len(self.borders.weights), self.n_parameters)
-
-
-def _room_for(n: int, keeps_pieces: bool = False) -> Samples:
-    return Samples(
-        points=np.empty((n, 2)),
-        rays=np.empty((n, 2)),
-        weights=np.empty(n),
-        regions=np.empty(n, np.int32),
-        pixel=np.empty(n, np.int64),
-        face=np.empty(n, np.int32),
-        chosen=np.empty(n, np.int64),
-        origins=np.empty((n, 3), np.float32),
-        directions=np.empty((n, 3), np.float32),
-        returns=Returns.empty(_RETURNS),
-        pieces=Pieces.empty(n if keeps_pieces else 0),
-    )
-
-
-def _room_for_borders(n: int, p: int) -> Borders:
-    return Borders(
-        placed=np.zeros(1, np.int64),
-        points=np.empty((n, 2)),
-        weights=np.empty(n),
-        regions=np.empty((n, 2), np.int32),
-        segment=np.empty(n, np.int32),
-        ends=np.empty((n, 2), np.int32),
-        along=np.empty((n, 2)),
-        side=np.empty(n),
-        along_v=np.empty(n, np.int8),
-        pixel=np.empty(n, np.int64),
-        depth=np.empty(n),
-        rates=np.empty((n, p)),
-    )
 
 
 @dataclass(frozen=True)
@@ -185,6 +78,8 @@ class AreaIntegral:
         Harmonic orders k > 1 wanted beside the signal.
     splits : int
         Boxes a side that every pixel is cut into before anything else.
+    rays : int
+        Not 0: rays a side of each pixel in place of the exact integral, see :func:`cast_rays`.
     """
 
     def __init__(
@@ -196,6 +91,7 @@ class AreaIntegral:
         albedo: float = 1.0,
         harmonics: tuple[int, ...] = (),
         splits: int = 1,
+        rays: int = 0,
     ) -> None:
         self.topology = topology
         self.intersector = intersector
@@ -203,6 +99,7 @@ class AreaIntegral:
         self.albedo = albedo
         self.harmonics = harmonics
         self.splits = splits
+        self.rays = rays
 
     @property
     def columns_hz(self) -> list[float]:
@@ -257,10 +154,10 @@ class AreaIntegral:
         lanes = [lane for i in range(workers) if (lane := tasks[i::workers])]
 
         def run(lane: Iterable[slice]) -> None:
-            if variant == "exact":
+            if variant == "exact" and not self.rays:
                 self._integrate(lane, poses, camera, light, sums, slopes)
             else:
-                self._cast_centres(lane, poses, camera, light, sums)
+                self._cast(lane, poses, camera, light, sums)
 
         mapped(run, lanes, workers)
         return sums
@@ -269,14 +166,15 @@ class AreaIntegral:
         self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums, slopes: Slopes | None
     ) -> None:
         """Integrate slices of the poses into `sums`, and `slopes` if they are asked for, in one thread."""
+        layout = Layout((camera.rows, camera.cols), n_parameters=0 if slopes is None else len(slopes.turns))
+        with lend_buffers(self.topology, layout) as buffers:
+            self._integrate_with(buffers, tasks, every, camera, light, sums, slopes)
+
+    def _integrate_with(
+        self, buffers: Buffers, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums,
+        slopes: Slopes | None,
+    ) -> None:  # fmt: skip
         mesh = self.topology
-        buffers = Buffers(
-            len(mesh.creases) + len(mesh.folds),
-            (camera.rows, camera.cols),
-            n_borders=0 if slopes is None else _BORDERS,
-            n_parameters=0 if slopes is None else len(slopes.turns),
-            n_parts=len(mesh.parts),
-        )
         for task in tasks:
             poses, own = of_poses(every, task), _of_views(sums, task)
             behind = poses.background[:, :2].any()
@@ -310,21 +208,54 @@ class AreaIntegral:
             if slope_sums is not None:
                 slope_sums.conclude()
 
-    def _cast_centres(self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums) -> None:
-        """Sum slices of the poses with one ray a pixel into `sums`, in one thread."""
-        v, u = np.mgrid[camera.first_row : camera.stop_row, : camera.cols] + 0.5
-        centres = np.column_stack([u.ravel(), v.ravel()])
+    def _cast(self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums) -> None:
+        """Sum slices of the poses with evenly spread rays into `sums`, in one thread."""
+        rays = self.rays or 1
         for task in tasks:
-            poses = of_poses(every, task)
-            n = len(poses.lens) * len(centres)
-            samples = _room_for(n)
-            samples.points[:] = np.tile(centres, (len(poses.lens), 1))
-            samples.weights[:] = 1.0
-            samples.pixel[:] = samples.chosen[:] = np.arange(n)
-            trace(0, n, samples, camera)
-            aim(n, samples, poses, camera)
-            samples.face[:] = self.intersector.first_face(samples.origins, samples.directions)
-            sum_samples(n, samples, self.topology, poses, camera, light, _of_views(sums, task))
+            poses, own = of_poses(every, task), _of_views(sums, task)
+            pixels = np.arange(len(poses.lens) * (camera.stop_row - camera.first_row) * camera.cols)
+            at_once = max(_RAYS_AT_ONCE // rays**2, 1)
+            for start in range(0, len(pixels), at_once):
+                samples = cast_rays(pixels[start : start + at_once], rays, poses, camera, self.intersector)
+                sum_samples(len(samples.pixel), samples, self.topology, poses, camera, light, own)
+
+
+def cast_rays(
+    pixels: NDArray[np.int64], rays: int, poses: Poses, camera: Camera, intersector: Intersector
+) -> Samples:
+    """Spread rays over the active areas of pixels and find what they meet.
+
+    Parameters
+    ----------
+    pixels : (m,) int64
+        Numbered in the order (pose, row, column).
+    rays : int
+        A side: the square of it is the number of rays of a pixel, which are a lattice of the golden section, in which
+        no two lie in one row or column. A single ray is that of the centre.
+    poses : Poses
+    camera : Camera
+    intersector : Intersector
+
+    Returns
+    -------
+    Samples
+    """
+    count = rays * rays
+    k, golden = np.arange(count), (math.sqrt(5) - 1) / 2
+    u, v = camera.fill_u * ((k + 0.5) / count - 0.5), camera.fill_v * ((k * golden + 0.5) % 1 - 0.5)
+    row, col = np.divmod(pixels % ((camera.stop_row - camera.first_row) * camera.cols), camera.cols)
+    n = len(pixels) * count
+    samples = room_for_samples(n)
+    samples.points[:, 0] = (col[:, None] + (0.5 + u)).ravel()
+    samples.points[:, 1] = (row[:, None] + (camera.first_row + 0.5 + v)).ravel()
+    samples.weights[:] = 1.0 / count
+    samples.pixel[:] = np.repeat(pixels, count)
+    samples.chosen[:] = np.arange(n)
+    samples.pieces.placed[0] = 0
+    trace(0, n, samples, camera)
+    aim(n, samples, poses, camera)
+    samples.face[:] = intersector.first_face(samples.origins, samples.directions)
+    return samples
 
 
 def find_faces(

@@ -49,8 +49,9 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     lens, matrix, offset = poses.lens[view], poses.matrix[view], poses.offset[view]
     n, crease, limb = np.int64(0), np.int64(0), np.int64(1)
     start_extents(edges)
-    for part in range(len(mesh.parts)):
-        edges.near[part] = part
+    every = edges.near[: len(mesh.parts)]
+    for part in range(len(every)):
+        every[part] = part
     for e in range(len(creases)):
         start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
         # a closed shell hides what turns its back, and a valley from everywhere but between its slopes
@@ -60,7 +61,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
         body, beside = mesh.part[face], mesh.part[other if other >= 0 else face]
-        if is_hidden(mesh, lens, vertices[start], vertices[end], body, beside, edges.near):
+        if is_hidden(mesh, lens, vertices[start], vertices[end], body, beside, every):
             continue
         n = _add_edge(vertices, start, end, crease, matrix, offset, camera, edges, n)
         if n < 0:

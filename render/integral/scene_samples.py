@@ -8,7 +8,6 @@ landmark leaves free, cell by cell.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,14 +16,15 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark.render.background import Background, background_hit, nearer_plane, parameters_of_views
 from phasemark.render.integral.area_integral import (
     NO_LEAST,
-    Buffers,
     camera_poses,
+    cast_rays,
     find_faces,
     of_poses,
     poses_of_views,
     topology_of,
 )
-from phasemark.render.integral.arguments import Camera, Poses, towards_landmark, towards_level
+from phasemark.render.integral.arguments import Camera, Poses, Samples, towards_landmark, towards_level
+from phasemark.render.integral.buffers import Buffers, Layout, lend_buffers
 from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.intersect import Intersector, make_intersector
@@ -94,19 +94,23 @@ class SceneMesh:
         self._use(topology, make_intersector(topology.vertices, topology.faces, intersector), WALL)
 
     @classmethod
-    def of_surface(cls, topology: MeshTopology, intersector: Intersector, n_parts: int) -> SceneMesh:
-        """Take samples of an analysed surface of `n_parts` parts, and resolve ranges of faces seen at a slant."""
+    def of_surface(cls, topology: MeshTopology, intersector: Intersector, n_parts: int, rays: int = 0) -> SceneMesh:
+        """Take samples of an analysed surface of `n_parts` parts, and resolve ranges of faces seen at a slant.
+
+        With `rays`, samples are so many rays a side of each cell.
+        """
         surface = cls.__new__(cls)
-        surface._use(topology, intersector, n_parts, resolves=True)
+        surface._use(topology, intersector, n_parts, resolves=True, rays=rays)
         return surface
 
-    def _use(self, topology: MeshTopology, intersector: Intersector, n_parts: int, *, resolves: bool = False) -> None:
+    def _use(
+        self, topology: MeshTopology, intersector: Intersector, n_parts: int, *, resolves: bool = False, rays: int = 0
+    ) -> None:
         self.topology = topology
+        self._rays = rays
         self._intersector = intersector
         self._n_parts = n_parts
         self._resolves = resolves
-        self._idle: defaultdict[tuple[int, int], list[Buffers]] = defaultdict(list)
-        """Scratch that no thread is using, by the size of its grid."""
 
     def samples(self, landmark2cam: ArrayLike, grid: Camera) -> SceneSamples:
         """Sample what a grid of cells sees.
@@ -172,38 +176,39 @@ class SceneMesh:
         return SceneSamples(start, *columns)
 
     def _of_pose(self, pose: Poses, grid: Camera, scale: tuple[float, float]) -> tuple[NDArray[np.float64], ...]:
+        if self._rays:
+            cells = np.arange((grid.stop_row - grid.first_row) * grid.cols)
+            samples = cast_rays(cells, self._rays, pose, grid, self._intersector)
+            return self._columns(len(samples.pixel), samples, None, pose, grid, scale)
+        layout = Layout((grid.stop_row - grid.first_row, grid.cols), _SAMPLES, keeps_pieces=self._resolves)
+        with lend_buffers(self.topology, layout) as buffers:
+            state = np.zeros((1, *layout.shape), np.uint8)
+            # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
+            radians_per_scale = 1.5
+            fastest = radians_per_scale / scale[0] if pose.background[0, :2].any() else 0.0
+            n = self._planned(NO_LEAST, pose, grid, fastest, state, buffers)
+            if len(self.topology.gloss):
+                least = np.ones((*layout.shape, 2), np.int64)
+                count_highlight_boxes(n, buffers.samples, self.topology, pose, grid, least)
+                if (least > 1).any():
+                    n = self._planned(least, pose, grid, fastest, state, buffers)
+            return self._columns(n, buffers.samples, state[0], pose, grid, scale)
+
+    def _columns(
+        self, n: int, samples: Samples, state: NDArray[np.uint8] | None, pose: Poses, grid: Camera,
+        scale: tuple[float, float],
+    ) -> tuple[NDArray[np.float64], ...]:  # fmt: skip
+        """Return what n samples see, and what stands behind the cells without any, as far as `state` names those."""
         mesh, background = self.topology, pose.background[0]
-        rows, cols = grid.stop_row - grid.first_row, grid.cols
-        state = np.zeros((1, rows, cols), np.uint8)
-        idle = self._idle[rows, cols]
-        try:
-            buffers = idle.pop()
-        except IndexError:  # every thread has scratch of its own
-            n_edges = len(mesh.creases) + len(mesh.folds)
-            buffers = Buffers(
-                n_edges, (rows, cols), n_samples=_SAMPLES, n_parts=len(mesh.parts), keeps_pieces=self._resolves
-            )
-        behind = bool(background[:2].any())
-        # what the rule for split cells takes as the turn of a phase, for each `finest_m` of range
-        radians_per_scale = 1.5
-        fastest = radians_per_scale / scale[0] if behind else 0.0
-        n = self._planned(NO_LEAST, pose, grid, fastest, state, buffers)
-        if len(mesh.gloss):
-            least = np.ones((rows, cols, 2), np.int64)
-            count_highlight_boxes(n, buffers.samples, mesh, pose, grid, least)
-            if (least > 1).any():
-                n = self._planned(least, pose, grid, fastest, state, buffers)
-        samples = buffers.samples
         counts, corners = np.zeros(samples.pieces.placed[0], np.int64), np.empty((4, 3))
         more = _count_points(samples, mesh, pose, grid, scale, corners, counts)
-        free = _count_free(state[0], pose, grid, background, scale) if behind else 0
-        room = n + more + free
+        fills = state is not None and bool(background[:2].any())
+        room = n + more + (_count_free(state, pose, grid, background, scale) if fills else 0)
         numbers = (np.empty(room) for _ in range(3))
         columns: tuple[NDArray[Any], ...] = np.empty((room, 2)), *numbers, np.empty(room, np.int32)
         kept = _hits(n, samples, counts, mesh, pose, grid, background, self._n_parts, scale, corners, columns)
-        idle.append(buffers)
-        if free:
-            kept = _fill_free(kept, state[0], pose, grid, background, scale, self._n_parts, columns)
+        if fills:
+            kept = _fill_free(kept, state, pose, grid, background, scale, self._n_parts, columns)
         return tuple(column[:kept] for column in columns)
 
     def _planned(

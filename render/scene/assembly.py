@@ -43,6 +43,8 @@ class Assembly:
         As for :class:`~phasemark.render.Renderer`.
     solids : bool
         Whether primitives are the solids they are; False: the meshes that stand for them.
+    crosses : bool
+        Whether curves along which bodies pass through one another are found; rays need none.
     """
 
     topology: MeshTopology
@@ -50,8 +52,10 @@ class Assembly:
     intersector: Intersector
     """Of the topology's faces."""
 
-    def __init__(self, bodies: Sequence[Body], intersector: str, *, solids: bool = True) -> None:
-        self._kind, self._bodies = intersector, bodies
+    def __init__(
+        self, bodies: Sequence[Body], intersector: str, *, solids: bool = True, crosses: bool = True
+    ) -> None:
+        self._kind, self._bodies, self._crosses = intersector, bodies, crosses
         self._facets: Assembly | None = None
         self._solids = _solids(bodies) if solids else [None] * len(bodies)
         self._own = _analysed(bodies, self._solids)
@@ -208,7 +212,8 @@ class Assembly:
             mesh.quadrics, mesh.curves, mesh.balls,
         )  # fmt: skip
         _turn_bodies(moved, self._poses, self._first, self._frames, placed, self._bounds)
-        self._cross(moved)
+        if self._crosses:
+            self._cross(moved)
         self.topology = self._with_curves()
         self.intersector = self._intersectors()
 

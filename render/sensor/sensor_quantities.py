@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -79,7 +80,7 @@ class SensorQuantities(SensorFields):
     @property
     def cam2level(self) -> NDArray[np.float64]:
         """Rotation Ry(pitch) · Rx(roll) from the tilted camera to the level one, (3, 3)."""
-        return np.asarray(tilt2level(*np.radians([[self.pitch_deg], [self.roll_deg]]))[0])
+        return _cam2level(self.pitch_deg, self.roll_deg).copy()
 
     @property
     def zone_offsets(self) -> NDArray[np.float64]:
@@ -275,4 +276,14 @@ class SensorQuantities(SensorFields):
 
         z = range · cosine. Tilting the camera turns both, so mounting does not enter.
         """
-        return np.asarray(self.pixel_directions() @ self.cam2level[:, 0])
+        return _axis_cosine(self).copy()
+
+
+@lru_cache(maxsize=64)
+def _cam2level(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
+    return np.asarray(tilt2level(*np.radians([[pitch_deg], [roll_deg]]))[0])
+
+
+@lru_cache(maxsize=16)
+def _axis_cosine(sensor: SensorQuantities) -> NDArray[np.float64]:
+    return np.asarray(sensor.pixel_directions() @ sensor.cam2level[:, 0])

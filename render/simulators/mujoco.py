@@ -132,6 +132,8 @@ class TofSensor:
         Frames per second of simulated time; None: ``frame_rate_hz`` of the sensor.
     latency_frames : int
         Frames between exposure and report; 0: none.
+    rays : int, optional
+        As for :class:`~phasemark.render.SceneRenderer`; None: exact.
     seed : int
         Of the noise: the same readings for the same seed and states.
 
@@ -155,6 +157,7 @@ class TofSensor:
         smooth: bool = True,
         rate_hz: float | None = None,
         latency_frames: int = 1,
+        rays: int | None = None,
         seed: int = 0,
     ) -> None:
         if not isinstance(model, mujoco.MjModel):
@@ -170,7 +173,7 @@ class TofSensor:
         self._exclude = -1 if exclude_body is None else _number(model, "body", exclude_body)
         self._groups = np.isin(np.arange(_GROUPS), groups).astype(np.uint8)
         self.seen = seen_model(model, albedo, self._exclude, groups, smooth)
-        self.renderer = SceneRenderer(Scene(self.seen.bodies), self.sensor)
+        self.renderer = SceneRenderer(Scene(self.seen.bodies), self.sensor, rays=rays)
         bodies = np.unique(self.seen.owner)
         self._of_body = (self.seen.owner[:, None] == bodies).astype(np.float64)
         self.bodies = tuple(body_name(model, int(b)) for b in bodies)
