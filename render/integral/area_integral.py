@@ -220,9 +220,7 @@ class AreaIntegral:
                 sum_samples(len(samples.pixel), samples, self.topology, poses, camera, light, own)
 
 
-def cast_rays(
-    pixels: NDArray[np.int64], rays: int, poses: Poses, camera: Camera, intersector: Intersector
-) -> Samples:
+def cast_rays(pixels: NDArray[np.int64], rays: int, poses: Poses, camera: Camera, intersector: Intersector) -> Samples:
     """Spread rays over the active areas of pixels and find what they meet.
 
     Parameters

@@ -21,7 +21,7 @@ EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
 _TRIFLE = 4e-6
 """Area times squared extent, in those of the box, under which a piece gets one line."""
-_STRIP, _LIMB_STRIP = 0.6, 0.25
+_STRIP, _LIMB_STRIP = 0.5, 0.25
 """Largest extent, in sides of the box, of a piece with one Gauss rule: in general, and where a limb runs across it."""
 _SHRINKS = 0.3
 """An interval shrinks to a point at an end of a strip where it is narrower than this share of its middle."""
@@ -233,25 +233,23 @@ def _interval(  # type: ignore[no-untyped-def]
     row = low * strip.k
     a, b = _bounds(s, low, i, strip, box, scratch)
     left, right = -np.inf, np.inf
-    behind_limb = False
+    # a limb whose surface is on its other side hides where ours ends
     for j in range(i - 1, -1, -1):
         side = edges[links[row + j], 4]
         if side != 0.0:
-            behind_limb = side < 0.0
+            seek_left = False
             if side > 0.0:
                 left = edge_at(edges, links[row + j], s)
             break
-    before_limb, alone = False, True
     for j in range(i, strip.k):
         side = edges[links[row + j], 4]
         if side != 0.0:
-            before_limb, alone = side > 0.0, False
+            seek_right = False
             if side < 0.0:
                 right = edge_at(edges, links[row + j], s)
             break
-    if not behind_limb:
-        if seek_left and left == -np.inf and not before_limb:
-            left = nearest_limb(scratch, s, 1.0, a)
-        if seek_right and alone:
-            right = nearest_limb(scratch, s, -1.0, b)
+    if seek_left:
+        left = nearest_limb(scratch, s, 1.0, a)
+    if seek_right:
+        right = nearest_limb(scratch, s, -1.0, b)
     return a, b, left, right

@@ -24,7 +24,7 @@ from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, al
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body, Surface
-from phasemark.render.scene.crossings import crossings
+from phasemark.render.scene.crossings import crossings, move_onto
 from phasemark.render.scene.solids import Solid
 
 _NO_GRID = FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_))
@@ -52,9 +52,7 @@ class Assembly:
     intersector: Intersector
     """Of the topology's faces."""
 
-    def __init__(
-        self, bodies: Sequence[Body], intersector: str, *, solids: bool = True, crosses: bool = True
-    ) -> None:
+    def __init__(self, bodies: Sequence[Body], intersector: str, *, solids: bool = True, crosses: bool = True) -> None:
         self._kind, self._bodies, self._crosses = intersector, bodies, crosses
         self._facets: Assembly | None = None
         self._solids = _solids(bodies) if solids else [None] * len(bodies)
@@ -227,8 +225,9 @@ class Assembly:
             (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
             ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
             if len(ends):
-                pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]])
-                self._curves[int(one), int(two)] = ends, pairs + self._first.face[[one, two]]
+                pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]]) + self._first.face[[one, two]]
+                move_onto(self._base, pairs, ends)
+                self._curves[int(one), int(two)] = ends, pairs
 
     def _placed_shell(self, b: int) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
         """Return the triangles of a body where it stands, and the face of the body that each of them stands for."""

@@ -49,6 +49,57 @@ def crossings(
 
 
 @njit(cache=True, nogil=True)
+def move_onto(mesh, pairs, ends):  # type: ignore[no-untyped-def]
+    """Move ends of segments, (k, 2, 3), onto the quadrics that the triangles of both bodies stand for.
+
+    Gauss–Newton steps of least length, on the faces `pairs` (k, 2); where surfaces only touch, ends stay.
+    """
+    gradient, value, steps = np.empty((2, 3)), np.empty(2), 3
+    for k in range(len(ends)):
+        if mesh.quadric[pairs[k, 0]] < 0 and mesh.quadric[pairs[k, 1]] < 0:
+            continue
+        longest = 0.0
+        for i in range(3):
+            longest += (ends[k, 1, i] - ends[k, 0, i]) ** 2
+        for end in range(2):
+            x, start = ends[k, end], ends[k, end].copy()
+            for _ in range(steps):
+                for i in range(2):
+                    value[i] = _height(mesh, pairs[k, i], x, gradient[i])
+                a, b, c = 0.0, 0.0, 0.0
+                for i in range(3):
+                    a += gradient[0, i] * gradient[0, i]
+                    b += gradient[0, i] * gradient[1, i]
+                    c += gradient[1, i] * gradient[1, i]
+                determinant = a * c - b * b
+                if determinant <= 1e-4 * a * c:
+                    break
+                first = (c * value[0] - b * value[1]) / determinant
+                second = (a * value[1] - b * value[0]) / determinant
+                for i in range(3):
+                    x[i] -= first * gradient[0, i] + second * gradient[1, i]
+            moved = 0.0
+            for i in range(3):
+                moved += (x[i] - start[i]) ** 2
+            if not moved < longest:
+                x[:] = start
+
+
+@njit(cache=True, nogil=True)
+def _height(mesh, f, x, gradient):  # type: ignore[no-untyped-def]
+    """Return how far a point is before the surface of a face, to first order a multiple of it; fill the gradient."""
+    if mesh.quadric[f] < 0:
+        gradient[:] = mesh.planes[f, :3]
+        return gradient[0] * x[0] + gradient[1] * x[1] + gradient[2] * x[2] - mesh.planes[f, 3]
+    q = mesh.quadrics[mesh.quadric[f]]
+    hx = q[0] * x[0] + q[3] * x[1] + q[4] * x[2] + q[6]
+    hy = q[3] * x[0] + q[1] * x[1] + q[5] * x[2] + q[7]
+    hz = q[4] * x[0] + q[5] * x[1] + q[2] * x[2] + q[8]
+    gradient[0], gradient[1], gradient[2] = 2.0 * hx, 2.0 * hy, 2.0 * hz
+    return x[0] * (hx + q[6]) + x[1] * (hy + q[7]) + x[2] * (hz + q[8]) + q[9]
+
+
+@njit(cache=True, nogil=True)
 def _block_bounds(vertices, faces):  # type: ignore[no-untyped-def]
     """Return lowest and highest coordinates of blocks of faces, (b, 2, 3)."""
     out = np.empty(((len(faces) + _BLOCK - 1) // _BLOCK, 2, 3))
