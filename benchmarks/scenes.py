@@ -24,7 +24,8 @@ def scenes(seed: int, median_seconds: Callable[..., float]) -> dict[str, Any]:
     for kind in ("boxes", "mixed"):
         bodies = _bodies(kind, np.random.default_rng(seed))
         for name, sensor in (("phasors", camera), ("histograms", preset("vl53l5cx-8x8"))):
-            rows += _timed(f"{_BODIES} {kind}, {name}", bodies, sensor, median_seconds)
+            for rays, how in ((None, ""), (10, ", 10 × 10 rays a pixel")):
+                rows += _timed(f"{_BODIES} {kind}, {name}{how}", bodies, sensor, rays, median_seconds)
     return {"rows": rows, "dense rays before 50 boxes": _dense(_bodies("boxes", np.random.default_rng(seed)), camera)}
 
 
@@ -51,9 +52,11 @@ def _at(place_m: tuple[float, float, float]) -> NDArray[np.float64]:
     return np.asarray(trimesh.transformations.translation_matrix(place_m))
 
 
-def _timed(what: str, bodies: list[Body], sensor: Sensor, median_seconds: Callable[..., float]) -> list[dict[str, Any]]:
+def _timed(
+    what: str, bodies: list[Body], sensor: Sensor, rays: int | None, median_seconds: Callable[..., float]
+) -> list[dict[str, Any]]:
     """Time frames of a camera that moves, then of one body and of all bodies that move too."""
-    renderer = SceneRenderer(Scene(bodies), sensor)
+    renderer = SceneRenderer(Scene(bodies), sensor, rays=rays)
     cameras = np.repeat(_at((-0.3, 0.0, 0.5))[None], _FRAMES, axis=0)
     cameras[:, 1, 3] = np.linspace(-0.2, 0.2, _FRAMES)
     still = np.repeat(renderer.scene.poses[None], _FRAMES, axis=0)

@@ -420,3 +420,12 @@ def test_environments_without_a_model_and_taken_keys_are_refused():
         TofObservation(gymnasium.Env(), camera="tof")
     with pytest.raises(UsageError, match="observes something under 'place' already"):
         TofObservation(Slider(DICTIONARY), camera="tof", key="place")
+
+
+def test_rays_read_the_same_scene_to_a_hundredth():
+    world = CAMERA + WALL + drawn(ROUND + FLAT[:1], 3)
+    exact, data = in_mujoco(world, PART)
+    quick, again = in_mujoco(world, PART, rays=10)
+    seen, close = exact.read(data).truth, quick.read(again).truth
+    assert np.sqrt(((seen.shares - close.shares) ** 2).mean()) < 1e-2
+    assert not np.array_equal(seen.shares, close.shares)

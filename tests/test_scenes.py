@@ -87,6 +87,61 @@ def test_random_scenes_of_2_to_40_bodies_are_what_very_dense_rays_see(seed):
     assert shares < 5e-4
 
 
+@pytest.mark.parametrize("name", ["pmd-16x16", "vl53l5cx-8x8"])
+def test_rays_converge_to_the_exact_frame(name):
+    solids = random_solids(np.random.default_rng(4), 20)
+    sensor, camera = preset(name).with_(rows=8, cols=8), placed((-0.4, 0.1, 0.5))
+    scene, behind = Scene(body_of(solid) for solid in solids), Background(wall_m=5.0)
+    exact = SceneRenderer(scene, sensor).render(camera, None, behind)
+
+    def errors_of(rays: int) -> tuple[float, float]:
+        image = SceneRenderer(scene, sensor, rays=rays).render(camera, None, behind)
+        light, expected = ((one.signal if isinstance(one, HistogramImages) else one.phasor) for one in (image, exact))
+        off = np.abs(light - expected) / np.abs(expected).max()
+        return float(np.sqrt((off**2).mean())), float(np.sqrt(((image.shares - exact.shares) ** 2).mean()))
+
+    assert max(errors_of(10)) < 1.5e-2
+    assert max(errors_of(60)) < 1.5e-3
+
+
+def test_one_ray_a_pixel_is_the_centre_ray_and_many_are_cast_in_parts(monkeypatch):
+    mesh, sensor = build_mesh(catalog()["cone"]), preset("pmd-16x16").with_(fill_factor=(0.8, 0.6))
+    alone = Renderer(mesh, sensor, albedo=0.8)
+    centres = alone.render(1.0, 0.4, variant="hard")
+    camera = placed(centres.views.lens_in_landmark()[0], centres.views.landmark2cam()[0][0].T)
+    scene = Scene([Body(mesh, 0.8)])
+    image = SceneRenderer(scene, sensor, rays=1).phasors(camera)
+    scale = np.abs(centres.phasor).max()
+    np.testing.assert_allclose(image.phasor / scale, centres.phasor / scale, atol=1e-9)
+    whole = SceneRenderer(scene, sensor, rays=5).phasors([camera, camera])
+    monkeypatch.setattr("phasemark.render.integral.area_integral._RAYS_AT_ONCE", 1000)
+    np.testing.assert_array_equal(SceneRenderer(scene, sensor, rays=5).phasors([camera, camera]).phasor, whole.phasor)
+    for rays in (0, 2.5, 513):
+        with pytest.raises(UsageError, match="'rays' must be a whole number from 1 to 512 a side of a pixel"):
+            SceneRenderer(scene, sensor, rays=rays)
+
+
+def test_scratch_of_a_large_scene_serves_a_small_one():
+    """What a scene leaves in scratch that is kept between calls must not be read by the next."""
+    small, sensor = [Solid("sphere", (0.2,), np.eye(3), np.array([1.5, 0.0, 0.0]), 0.5)], WIDE
+    small += [Solid("box", (0.1, 0.1, 0.1), np.eye(3), np.array([1.0, 0.3, 0.0]), 0.5)]
+    large = random_solids(np.random.default_rng(5), 30)
+    alone = SceneRenderer(Scene(body_of(one) for one in small), sensor).phasors(placed()).phasor
+    SceneRenderer(Scene(body_of(one) for one in large), sensor).phasors(placed((-0.4, 0.1, 0.5)))
+    again = SceneRenderer(Scene(body_of(one) for one in small), sensor).phasors(placed()).phasor
+    np.testing.assert_array_equal(again, alone)
+
+
+def test_crossings_of_round_bodies_lie_on_both():
+    place = np.array([0.15, 0.03, 0.02])
+    bodies = Body.sphere(0.2), Body.capsule(0.1, 0.3, pose=placed(tuple(place)))
+    ends = SceneRenderer(Scene(bodies), WIDE)._assembly.topology.vertices  # round bodies have no others
+    axis = np.column_stack([np.zeros((len(ends), 2)), np.clip(ends[:, 2] - place[2], -0.15, 0.15)])
+    assert len(ends) > 100
+    np.testing.assert_allclose(np.linalg.norm(ends, axis=1), 0.2, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(ends - place - axis, axis=1), 0.1, atol=1e-9)
+
+
 @pytest.mark.parametrize("name", sorted(catalog()))
 def test_a_landmark_alone_is_rendered_as_by_its_renderer(name):
     mesh, sensor = build_mesh(catalog()[name]), preset("pmd-16x16")

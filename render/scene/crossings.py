@@ -52,15 +52,18 @@ def crossings(
 def move_onto(mesh, pairs, ends):  # type: ignore[no-untyped-def]
     """Move ends of segments, (k, 2, 3), onto the quadrics that the triangles of both bodies stand for.
 
-    Gauss–Newton steps of least length, on the faces `pairs` (k, 2); where surfaces only touch, ends stay.
+    Gauss–Newton steps of least length, on the faces `pairs` (k, 2). Where surfaces only touch, and where an end would
+    move by more than the longest segment, it stays.
     """
-    gradient, value, steps = np.empty((2, 3)), np.empty(2), 3
+    gradient, value, steps, longest = np.empty((2, 3)), np.empty(2), 3, 0.0
+    for k in range(len(ends)):
+        square = 0.0
+        for i in range(3):
+            square += (ends[k, 1, i] - ends[k, 0, i]) ** 2
+        longest = max(longest, square)
     for k in range(len(ends)):
         if mesh.quadric[pairs[k, 0]] < 0 and mesh.quadric[pairs[k, 1]] < 0:
             continue
-        longest = 0.0
-        for i in range(3):
-            longest += (ends[k, 1, i] - ends[k, 0, i]) ** 2
         for end in range(2):
             x, start = ends[k, end], ends[k, end].copy()
             for _ in range(steps):
