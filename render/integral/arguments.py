@@ -141,6 +141,10 @@ class Light(NamedTuple):
     lamp_step: float
 
 
+HIDDEN_LIMB = 2
+"""Kind of a limb that another body hides: no edge of the image, yet a surface that is seen beside it ends there."""
+
+
 class Edges(NamedTuple):
     """The edges of one view, and which of them each pixel has.
 
@@ -150,7 +154,9 @@ class Edges(NamedTuple):
         u, v of both ends. With distortion, an edge is a chain of links.
     limb : (e,) int8
         1 for a silhouette of a smooth surface; then the surface lies on the side where
-        du·(v − v_a) − dv·(u − u_a) < 0.
+        du·(v − v_a) − dv·(u − u_a) < 0. :data:`HIDDEN_LIMB` where another body hides it.
+    body : (e,) int32
+        Part of the surface that a silhouette belongs to, −1 where that is not known.
     head : (rows + 2, cols + 2) int32
         First entry of each pixel's list, −1: none; with a border of one pixel around the image.
     link, owner : (m,) int32
@@ -171,6 +177,7 @@ class Edges(NamedTuple):
 
     segments: NDArray[np.float64]
     limb: NDArray[np.int8]
+    body: NDArray[np.int32]
     head: NDArray[np.int32]
     link: NDArray[np.int32]
     owner: NDArray[np.int32]

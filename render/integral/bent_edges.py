@@ -55,7 +55,7 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     start, end : int
         Its vertices, as ``edges.ends`` has them.
     limb : int
-        Whether it is a limb.
+        As :class:`~phasemark.render.integral.arguments.Edges` has it.
     camera : Camera
     edges : Edges
         ``segments``, ``limb`` and ``ends`` are written from `n` on; ``extent`` grows.
@@ -68,7 +68,7 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     """
     lens, segments = camera.distortion, edges.segments
     if start >= 0:  # the background belongs to every pixel, whether its edge is there or not
-        for k in range(1 + limb):
+        for k in range(1 + (limb == 1)):
             extent = edges.extent[k]
             extent[0], extent[1] = min(extent[0], ya, yb), max(extent[1], ya, yb)
             extent[2], extent[3] = min(extent[2], za, zb), max(extent[3], za, zb)
@@ -89,7 +89,7 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     if n + links >= len(segments):
         return FULL
     for i in range(n, n + links):
-        edges.limb[i] = limb
+        edges.limb[i], edges.body[i] = limb, -1
         edges.ends[i, 0], edges.ends[i, 1] = start, end
     if links == 1:
         segments[n, 0], segments[n, 1], segments[n, 2], segments[n, 3] = ua, va, ub, vb

@@ -54,6 +54,7 @@ class Buffers:
         self.edges = Edges(
             segments=np.empty((0, 4)),
             limb=np.empty(0, np.int8),
+            body=np.empty(0, np.int32),
             head=np.empty((rows + 2, cols + 2), np.int32),
             link=np.empty(n_links, np.int32),
             owner=np.empty(n_links, np.int32),
@@ -89,7 +90,10 @@ class Buffers:
 
     def _make_segments(self, n: int) -> None:
         self.edges = self.edges._replace(
-            segments=np.empty((n, 4)), limb=np.empty(n, np.int8), ends=np.empty((n, 2), np.int32)
+            segments=np.empty((n, 4)),
+            limb=np.empty(n, np.int8),
+            body=np.empty(n, np.int32),
+            ends=np.empty((n, 2), np.int32),
         )
 
 

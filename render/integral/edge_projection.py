@@ -15,6 +15,7 @@ import math
 
 import numpy as np
 
+from phasemark.render.integral.arguments import HIDDEN_LIMB
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
 from phasemark.render.integral.convex_parts import is_hidden, list_parts
 from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, segments_of
@@ -89,9 +90,15 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 if n < 0:
                     return FULL
     for c in range(len(mesh.curves)):
+        first = n
         n = _add_curve(mesh, mesh.curves[c], lens, matrix, offset, camera, edges, n)
         if n < 0:
             return FULL
+        hidden = True
+        for k in range(first, n):
+            hidden = hidden and edges.limb[k] == HIDDEN_LIMB
+        if hidden:  # nothing is seen of what ends there
+            n = first
     return n
 
 
@@ -176,7 +183,9 @@ def _turns_left(points, arc, lens):  # type: ignore[no-untyped-def]
 def _add_segment(mesh, lens, body, limb, left, near, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append a segment of a round edge, whose surface is on its left or on its right."""
     if is_hidden(mesh, lens, edges.points[0], edges.points[1], body, body, near):
-        return n
+        if limb == 0:
+            return n
+        limb = np.int64(HIDDEN_LIMB)
     spare = 2  # for the background, and for one more
     if n + spare > len(edges.segments):
         return FULL
@@ -184,7 +193,7 @@ def _add_segment(mesh, lens, body, limb, left, near, matrix, offset, camera, edg
     before = n
     n = _add_edge(edges.points, a, b, limb, matrix, offset, camera, edges, n)
     for k in range(before, n):
-        edges.ends[k, 0] = -1
+        edges.ends[k, 0], edges.body[k] = -1, body
     return n
 
 
@@ -196,7 +205,7 @@ def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: 
         if project(vertices, a, b, matrix, offset, TANGENTS, line):
             n = add_bent_edge(line[0], line[1], line[2], line[3], a, b, limb, camera, edges, n)
     elif project(vertices, a, b, matrix, offset, camera, edges.segments[n]):
-        edges.limb[n] = limb
+        edges.limb[n], edges.body[n] = limb, -1
         edges.ends[n, 0], edges.ends[n, 1] = a, b
         n += 1
     return n

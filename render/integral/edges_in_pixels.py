@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from phasemark.render.integral.arguments import HIDDEN_LIMB
 from phasemark.render.kernel import kernel
 
 MAX_SEGMENTS = 128
@@ -79,7 +80,8 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
 def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
-    Its rows are s, x of both ends (s rising), the limb's side, the slope and the segment, sorted by where they begin.
+    Its rows are s, x of both ends (s rising), the limb's side, the slope, the segment and the body whose limb it is,
+    sorted by where they begin. Limbs that are hidden are left out.
     The side is +1 where the surface lies towards larger x, −1 towards smaller x, 0 for a crease. Returns their number,
     or −1 if there are too many.
     """
@@ -89,6 +91,8 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
     while entry >= 0:
         k = owner[entry]
         entry = link[entry]
+        if limb[k] == HIDDEN_LIMB:
+            continue
         ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
         du, dv = ub - ua, vb - va
         lo, hi = clip(ua, va, ub, vb, u0, v0, u1, v1)
@@ -109,7 +113,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
         clipped[m, 4] = side if limb[k] else 0.0
         length = clipped[m, 2] - clipped[m, 0]
         clipped[m, 5] = (clipped[m, 3] - clipped[m, 1]) / length if length > 0.0 else 0.0
-        clipped[m, 6] = k
+        clipped[m, 6], clipped[m, 7] = k, edges.body[k]
         begin, place = clipped[m, 0], m
         while place > 0 and clipped[order[place - 1], 0] > begin:
             order[place] = order[place - 1]
@@ -117,7 +121,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
         order[place] = m
         m += 1
     for i in range(m):
-        for j in range(7):
+        for j in range(8):
             scratch.edges[i, j] = clipped[order[i], j]
     return m
 

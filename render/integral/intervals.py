@@ -232,24 +232,26 @@ def _interval(  # type: ignore[no-untyped-def]
             high = middle
     row = low * strip.k
     a, b = _bounds(s, low, i, strip, box, scratch)
-    left, right = -np.inf, np.inf
-    # a limb whose surface is on its other side hides where ours ends
+    # a limb whose surface is on its other side hides where ours ends, unless our body is known
+    left, right, body, open_left, open_right = -np.inf, np.inf, -1.0, True, True
     for j in range(i - 1, -1, -1):
-        side = edges[links[row + j], 4]
-        if side != 0.0:
-            seek_left = False
-            if side > 0.0:
-                left = edge_at(edges, links[row + j], s)
+        e = links[row + j]
+        if edges[e, 4] != 0.0:
+            if edges[e, 4] > 0.0:
+                left, body = edge_at(edges, e, s), edges[e, 7]
+            open_left = False
             break
     for j in range(i, strip.k):
-        side = edges[links[row + j], 4]
-        if side != 0.0:
-            seek_right = False
-            if side < 0.0:
-                right = edge_at(edges, links[row + j], s)
+        e = links[row + j]
+        if edges[e, 4] != 0.0:
+            if edges[e, 4] < 0.0:
+                right, body = edge_at(edges, e, s), edges[e, 7]
+            open_right = False
             break
-    if seek_left:
-        left = nearest_limb(scratch, s, 1.0, a)
-    if seek_right:
-        right = nearest_limb(scratch, s, -1.0, b)
+    if seek_left and open_left:
+        left, body = nearest_limb(scratch, s, 1.0, a, body)
+    if seek_right and right == np.inf and (open_right or body >= 0.0):
+        right, body = nearest_limb(scratch, s, -1.0, b, body)
+    if seek_left and left == -np.inf and body >= 0.0:
+        left, _ = nearest_limb(scratch, s, 1.0, a, body)
     return a, b, left, right

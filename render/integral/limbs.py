@@ -15,7 +15,7 @@ _REACH = 0.5
 def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
     """Return whether a limb is among the segments listed from `entry` on."""
     while entry >= 0:
-        if edges.limb[edges.owner[entry]]:
+        if edges.limb[edges.owner[entry]] == 1:
             return True
         entry = edges.link[entry]
     return False
@@ -23,7 +23,7 @@ def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
 
 @kernel
 def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-def]
-    """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds.
+    """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds, body (−1: not known).
 
     Those whose surface lies towards larger x go to ``scratch.limbs[0]``, the others to ``scratch.limbs[1]``;
     ``scratch.n_limbs`` has their numbers. What no longer fits is left out.
@@ -47,21 +47,24 @@ def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-de
         if sa > sb:
             sa, xa, sb, xb = sb, xb, sa, xa
         limbs[which, n, 0], limbs[which, n, 1], limbs[which, n, 2] = sa, xa, sb
-        limbs[which, n, 3] = (xb - xa) / (sb - sa)
+        limbs[which, n, 3], limbs[which, n, 4] = (xb - xa) / (sb - sa), edges.body[k]
         count[which] += 1
 
 
 @kernel
-def nearest_limb(scratch, s, side, bound):  # type: ignore[no-untyped-def]
+def nearest_limb(scratch, s, side, bound, body):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 
-    A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end.
+    A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end. Only those of
+    `body` are asked, of any where that is negative. Returns where it is, ∓inf where there is none, and its body.
     """
     limbs, n_limbs = scratch.limbs, scratch.n_limbs
     which = 0 if side > 0 else 1
-    best = -np.inf if side > 0 else np.inf
+    best, whose = -np.inf if side > 0 else np.inf, body
     closest = _REACH
     for i in range(n_limbs[which]):
+        if body >= 0 and limbs[which, i, 4] != body:
+            continue
         gap = max(limbs[which, i, 0] - s, s - limbs[which, i, 2], 0.0)
         if gap > closest:
             continue
@@ -72,5 +75,5 @@ def nearest_limb(scratch, s, side, bound):  # type: ignore[no-untyped-def]
         if (side > 0 and x > bound) or (side < 0 and x < bound):
             continue
         if gap < closest or (side > 0 and x > best) or (side < 0 and x < best):
-            best, closest = x, gap
-    return best
+            best, closest, whose = x, gap, limbs[which, i, 4]
+    return best, whose

@@ -33,13 +33,13 @@ class Scratch(NamedTuple):
     ----------
     boxes : (4 * _MAX_DEPTH + 4, 5) float64
         Parts of the pixel still to be split: u, v of two corners, level.
-    clipped : (MAX_SEGMENTS, 7) float64
+    clipped : (MAX_SEGMENTS, 8) float64
         The edges of a box as they come.
     order : (MAX_SEGMENTS,) int64
         Their order.
-    edges : (MAX_SEGMENTS, 7) float64
+    edges : (MAX_SEGMENTS, 8) float64
         The same in order: s, x of both ends (s rising), side of the surface where the edge is a limb, slope dx/ds,
-        number of the segment.
+        number of the segment, and the body whose limb it is (−1: not known).
     n_edges : (1,) int64
         How many there are.
     events : (MAX_EVENTS,) float64
@@ -50,7 +50,7 @@ class Scratch(NamedTuple):
         Begin and end of the slabs of a strip.
     links : (MAX_LINKS,) int64
         Edges of the slabs of a strip, slab by slab.
-    limbs : (2, MAX_LIMBS, 4) float64
+    limbs : (2, MAX_LIMBS, 5) float64
         Limbs of the pixel and its neighbours, see :func:`collect_limbs`.
     n_limbs : (2,) int64
     found : (MAX_SEGMENTS + 1,) int64
@@ -82,14 +82,14 @@ class Scratch(NamedTuple):
         """Return scratch for one thread."""
         return cls(
             boxes=np.empty((4 * _MAX_DEPTH + 4, 5)),
-            clipped=np.empty((MAX_SEGMENTS, 7)),
+            clipped=np.empty((MAX_SEGMENTS, 8)),
             order=np.empty(MAX_SEGMENTS, np.int64),
-            edges=np.empty((MAX_SEGMENTS, 7)),
+            edges=np.empty((MAX_SEGMENTS, 8)),
             events=np.empty(MAX_EVENTS),
             active=np.empty(MAX_SEGMENTS, np.int64),
             slabs=np.empty((MAX_SLABS, 2)),
             links=np.empty(MAX_LINKS, np.int64),
-            limbs=np.empty((2, MAX_LIMBS, 4)),
+            limbs=np.empty((2, MAX_LIMBS, 5)),
             n_limbs=np.zeros(2, np.int64),
             n_edges=np.zeros(1, np.int64),
             found=np.empty(MAX_SEGMENTS + 1, np.int64),
@@ -162,9 +162,9 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
         ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
         lo, hi = clip(ua, va, ub, vb, c, r, c + 1, r + 1)
         du, dv = max(hi - lo, 0.0) * abs(ub - ua), max(hi - lo, 0.0) * abs(vb - va)
-        if limb[k]:
+        if limb[k] == 1:
             limb_u, limb_v = limb_u + du, limb_v + dv
-        else:
+        elif limb[k] == 0:
             crease_u, crease_v = crease_u + du, crease_v + dv
         entry = link[entry]
     has_limb = limb_u > 0.0 or limb_v > 0.0
@@ -231,7 +231,7 @@ def _extent_of_limbs(entry, edges, u0, v0, u1, v1):  # type: ignore[no-untyped-d
     while entry >= 0:
         k = edges.owner[entry]
         entry = edges.link[entry]
-        if edges.limb[k]:
+        if edges.limb[k] == 1:
             ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
             lo, hi = clip(ua, va, ub, vb, u0, v0, u1, v1)
             along_u += max(hi - lo, 0.0) * abs(ub - ua)
