@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -118,7 +118,7 @@ def test_one_ray_a_pixel_is_the_centre_ray_and_many_are_cast_in_parts(monkeypatc
     np.testing.assert_array_equal(SceneRenderer(scene, sensor, rays=5).phasors([camera, camera]).phasor, whole.phasor)
     for rays in (0, 2.5, 513):
         with pytest.raises(UsageError, match="'rays' must be a whole number from 1 to 512 a side of a pixel"):
-            SceneRenderer(scene, sensor, rays=rays)
+            SceneRenderer(scene, sensor, rays=cast(Any, rays))
 
 
 def test_scratch_of_a_large_scene_serves_a_small_one():

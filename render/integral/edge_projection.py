@@ -90,16 +90,20 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 if n < 0:
                     return FULL
     for c in range(len(mesh.curves)):
-        first = n
-        n = _add_curve(mesh, mesh.curves[c], lens, matrix, offset, camera, edges, n)
-        if n < 0:
+        stop = _add_curve(mesh, mesh.curves[c], lens, matrix, offset, camera, edges, n)
+        if stop < 0:
             return FULL
-        hidden = True
-        for k in range(first, n):
-            hidden = hidden and edges.limb[k] == HIDDEN_LIMB
-        if hidden:  # nothing is seen of what ends there
-            n = first
+        n = _seen(n, stop, edges)
     return n
+
+
+@kernel
+def _seen(first, stop, edges):  # type: ignore[no-untyped-def]
+    """Return where the segments of a curve stop, or their first where all of them are hidden."""
+    for k in range(first, stop):
+        if edges.limb[k] != HIDDEN_LIMB:
+            return stop
+    return first
 
 
 @kernel
