@@ -97,7 +97,7 @@ class SceneMesh:
     def of_surface(cls, topology: MeshTopology, intersector: Intersector, n_parts: int, rays: int = 0) -> SceneMesh:
         """Take samples of an analysed surface of `n_parts` parts, and resolve ranges of faces seen at a slant.
 
-        With `rays`, samples are so many rays a side of each cell.
+        `rays`, if not 0, is how many rays a side of each cell are cast in place of that.
         """
         surface = cls.__new__(cls)
         surface._use(topology, intersector, n_parts, resolves=True, rays=rays)

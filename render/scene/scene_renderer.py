@@ -32,7 +32,7 @@ from phasemark.render.threads import mapped
 _TOUCH_M = 1e-9
 _MOST_BYTES = 4 << 30
 """Of the shares of one call."""
-_MOST_RAYS = 512
+_MOST_RAYS = 100
 
 
 class SceneRenderer:
