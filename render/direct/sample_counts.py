@@ -26,7 +26,6 @@ from phasemark.render.direct.footprints import (
 from phasemark.render.direct.transients import PARTS, through_lens
 from phasemark.render.integral.scene_samples import FLOOR, WALL, SceneSamples
 from phasemark.render.kernel import kernel
-from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
 _ALL_PARTS = FLOOR + 1
@@ -156,15 +155,6 @@ def _optics_of(sensor: Sensor) -> _Optics:
     offset = np.broadcast_to(sensor.zone_offsets + sensor.range_offset_m, (sensor.rows, sensor.cols)).ravel()
     width_m = histogram.bin_width_m * sensor.zone_values("zone_bin_scale").ravel()
     begin_m = histogram.start_m - offset - histogram.irf_reach_m[0]
-    alike = len(histogram.irf) <= 1 and np.ptp(width_m) == 0
-    share = np.stack([_shares(histogram, zone, width_m[zone]) for zone in range(1 if alike else n_zones)])
-    response = _Response(share, begin_m, width_m)
-    scale = sensor.zone_values("zone_gain").ravel() / footprint_areas(zones)
-    return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
-
-
-def _shares(histogram: Histogram, zone: int, width_m: float) -> NDArray[np.float64]:
-    """Return the shares of bins of a width, (phases + 1, taps); see :class:`_Response`."""
     low, high = histogram.irf_reach_m
     if histogram.irf_std_m is not None:
         steps_per_std = 64
@@ -172,9 +162,14 @@ def _shares(histogram: Histogram, zone: int, width_m: float) -> NDArray[np.float
     else:
         steps_per_sample = 32
         step = (high - low) / ((len(histogram.irf[0]) - 1) * steps_per_sample)
-    taps = math.ceil((high - low) / width_m) + 1
-    phase = np.linspace(0.0, 1.0, math.ceil(width_m / step) + 1)
-    return np.diff(response_share(low + (np.arange(taps + 1) - phase[:, None]) * width_m, histogram, zone), axis=1)
+    phase = np.linspace(0.0, 1.0, math.ceil(width_m.max() / step) + 1)[:, None]
+    edges = np.arange(math.ceil((high - low) / width_m.min()) + 2) - phase  # of bins, from where the response begins
+    alike = len(histogram.irf) <= 1 and np.ptp(width_m) == 0
+    zones_apart = range(1 if alike else n_zones)
+    share = np.stack([np.diff(response_share(low + edges * width_m[q], histogram, q), axis=1) for q in zones_apart])
+    response = _Response(share, begin_m, width_m)
+    scale = sensor.zone_values("zone_gain").ravel() / footprint_areas(zones)
+    return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
 
 
 @kernel
