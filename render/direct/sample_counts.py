@@ -32,7 +32,7 @@ _ALL_PARTS = FLOOR + 1
 
 
 class _Response(NamedTuple):
-    """How light is shared among bins, for places of the earliest of them relative to its range.
+    """Shares of light by bins, for each place where its response may begin in the earliest of them.
 
     Parameters
     ----------

@@ -23,7 +23,7 @@ _MOST_KEPT_SAMPLES = 1 << 18
 
 
 class Layout(NamedTuple):
-    """What scratch is for.
+    """Use that scratch is made for.
 
     Parameters
     ----------

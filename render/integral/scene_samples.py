@@ -198,7 +198,7 @@ class SceneMesh:
         self, n: int, samples: Samples, state: NDArray[np.uint8] | None, pose: Poses, grid: Camera,
         scale: tuple[float, float],
     ) -> tuple[NDArray[np.float64], ...]:  # fmt: skip
-        """Return what n samples see, and what stands behind the cells without any, as far as `state` names those."""
+        """Return the points that n samples see, and the background's in cells of `state` that have no samples."""
         mesh, background = self.topology, pose.background[0]
         counts, corners = np.zeros(samples.pieces.placed[0], np.int64), np.empty((4, 3))
         more = _count_points(samples, mesh, pose, grid, scale, corners, counts)
