@@ -116,7 +116,7 @@ def test_one_ray_a_pixel_is_the_centre_ray_and_many_are_cast_in_parts(monkeypatc
     whole = SceneRenderer(scene, sensor, rays=5).phasors([camera, camera])
     monkeypatch.setattr("phasemark.render.integral.area_integral._RAYS_AT_ONCE", 1000)
     np.testing.assert_array_equal(SceneRenderer(scene, sensor, rays=5).phasors([camera, camera]).phasor, whole.phasor)
-    for rays in (0, 2.5, 101):
+    for rays in (0, 2.5, 101, "10"):
         with pytest.raises(UsageError, match="'rays' must be a whole number from 1 to 100 a side of a pixel"):
             SceneRenderer(scene, sensor, rays=cast(Any, rays))
 

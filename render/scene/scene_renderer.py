@@ -59,7 +59,8 @@ class SceneRenderer:
     Raises
     ------
     UsageError
-        The sensor's lamp is not described, or the sensor counts histograms, which have no bounces.
+        The sensor's lamp is not described, the sensor counts histograms, which have no bounces, or `rays` is no whole
+        number from 1 to 100.
 
     Examples
     --------
@@ -91,9 +92,9 @@ class SceneRenderer:
         self._harmonics = tuple(sensor.harmonic_orders if harmonics is None else harmonics)
         self._intersector = intersector
         check_bounces(bounces, bounce_tolerance, sensor)
-        if rays is not None and (rays != int(rays) or not 1 <= rays <= _MOST_RAYS):
+        if rays is not None and (not isinstance(rays, int) or not 1 <= rays <= _MOST_RAYS):
             raise UsageError(f"'rays' must be a whole number from 1 to {_MOST_RAYS} a side of a pixel, got {rays!r}")
-        self._rays = 0 if rays is None else int(rays)
+        self._rays = rays or 0
         self._assembly = Assembly(scene.bodies, intersector, crosses=not self._rays)
         self.bounces = bounces
         self.bounce_tolerance = bounce_tolerance
