@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from phasemark.render.integral.arguments import HIDDEN_LIMB
 from phasemark.render.kernel import kernel
 
 MAX_LIMBS = 256
@@ -23,8 +24,9 @@ def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
 
 @kernel
 def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-def]
-    """Append a pixel's limbs: rows of s, x at the low end, s at the high end, slope dx/ds, body (−1: not known).
+    """Append a pixel's limbs: s, x at the low end, s at the high end, slope dx/ds, body, whether it is hidden.
 
+    The body is −1 where it is not known.
     Those whose surface lies towards larger x go to ``scratch.limbs[0]``, the others to ``scratch.limbs[1]``;
     ``scratch.n_limbs`` has their numbers. What no longer fits is left out.
     """
@@ -48,6 +50,7 @@ def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-de
             sa, xa, sb, xb = sb, xb, sa, xa
         limbs[which, n, 0], limbs[which, n, 1], limbs[which, n, 2] = sa, xa, sb
         limbs[which, n, 3], limbs[which, n, 4] = (xb - xa) / (sb - sa), edges.body[k]
+        limbs[which, n, 5] = limb[k] == HIDDEN_LIMB
         count[which] += 1
 
 
@@ -56,14 +59,15 @@ def nearest_limb(scratch, s, side, bound, body):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 
     A limb that ends before it reaches the line (at a rim, say) still shapes the surface beside its end. Only those of
-    `body` are asked, of any where that is negative. Returns where it is, ∓inf where there is none, and its body.
+    `body` are asked; where that is negative, those of any that are not hidden. Returns where it is, ∓inf where there is
+    none, and its body.
     """
     limbs, n_limbs = scratch.limbs, scratch.n_limbs
     which = 0 if side > 0 else 1
     best, whose = -np.inf if side > 0 else np.inf, body
     closest = _REACH
     for i in range(n_limbs[which]):
-        if body >= 0 and limbs[which, i, 4] != body:
+        if limbs[which, i, 4] != body and (body >= 0.0 or limbs[which, i, 5] > 0.0):
             continue
         gap = max(limbs[which, i, 0] - s, s - limbs[which, i, 2], 0.0)
         if gap > closest:

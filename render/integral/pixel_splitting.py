@@ -50,7 +50,7 @@ class Scratch(NamedTuple):
         Begin and end of the slabs of a strip.
     links : (MAX_LINKS,) int64
         Edges of the slabs of a strip, slab by slab.
-    limbs : (2, MAX_LIMBS, 5) float64
+    limbs : (2, MAX_LIMBS, 6) float64
         Limbs of the pixel and its neighbours, see :func:`collect_limbs`.
     n_limbs : (2,) int64
     found : (MAX_SEGMENTS + 1,) int64
@@ -89,7 +89,7 @@ class Scratch(NamedTuple):
             active=np.empty(MAX_SEGMENTS, np.int64),
             slabs=np.empty((MAX_SLABS, 2)),
             links=np.empty(MAX_LINKS, np.int64),
-            limbs=np.empty((2, MAX_LIMBS, 5)),
+            limbs=np.empty((2, MAX_LIMBS, 6)),
             n_limbs=np.zeros(2, np.int64),
             n_edges=np.zeros(1, np.int64),
             found=np.empty(MAX_SEGMENTS + 1, np.int64),
