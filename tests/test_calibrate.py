@@ -158,7 +158,7 @@ def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_
     """Five frames do not tell their noise, so it says nothing of which pixels are faint.
 
     One calibration in six ends in a minimum beside the right one; its fit is poor, as that of all of them.
-    Seed [77, 0] is such a one.
+    Seed [77, 0] ends there.
     """
     values = []
     for seed in range(5):
