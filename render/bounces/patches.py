@@ -183,7 +183,8 @@ def make_patches(
 ) -> Patches:
     """Cut the surfaces of a scene into patches.
 
-    Facets too long are cut in two across their longest edge. Facets that lie beside one another and face alike are
+    Faces are cut along the outlines of bodies that stand on them, and then in two across their longest edge until none
+    is too long: what lies beside a body is as small as `size_at` says of that place, and not of one below it. Facets that lie beside one another and face alike are
     joined, so that a curved mesh of many faces has few patches. A part of a surface inside a closed body, as the floor
     below a box, has none.
 
@@ -200,11 +201,10 @@ def make_patches(
     """
     lift = _lift_of(topology)
     normals = topology.planes[:, :3]
-    triangles, face, sizes = _cut(
-        topology.vertices[topology.faces], np.arange(len(topology.faces)), lambda at, own: size_at(at, normals[own])
+    triangles, face = cut_where_bodies_stand(
+        topology.vertices[topology.faces], np.arange(len(topology.faces)), topology, lift
     )
-    triangles, own = cut_where_bodies_stand(triangles, face, topology, lift)
-    face, sizes = face[own], sizes[own]
+    triangles, face, sizes = _cut(triangles, face, lambda at, own: size_at(at, normals[own]))
     solid = _Solid(topology, intersector, lift)
     buried = solid.buries(triangles, face)
     edges = triangles[:, 1:] - triangles[:, :1]

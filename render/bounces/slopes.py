@@ -49,11 +49,9 @@ def slopes_of(patches: Patches) -> Slopes:
     flat = offset - height[:, :, None] * unit[:, None]
     weight = np.where(beside, 1 / (distance**2 + (0.5 * patches.size[:, None]) ** 2), 0.0)
     normal_equations = np.einsum("nk,nki,nkj->nij", weight, flat, flat)
-    scale = np.trace(normal_equations, axis1=1, axis2=2)
-    scale = np.where(scale > 0, scale, 1.0)[:, None, None]
     along_normal = unit[:, :, None] * unit[:, None]  # no slope out of the surface
-    slightly = 1e-4  # where all neighbours lie in a row, no slope across it
-    inverse = np.linalg.inv(normal_equations + scale * (along_normal + slightly * np.eye(3)))
+    slightly = 0.1  # no slope in a direction in which no neighbour lies as far as the patch is large
+    inverse = np.linalg.inv(normal_equations + along_normal + slightly * np.eye(3))
     shares = np.einsum("nij,nkj,nk->ink", inverse, flat, weight)
     rows = np.repeat(np.arange(n), count)
     maps = []
