@@ -15,6 +15,7 @@ import threading
 import time
 import urllib.request
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +34,10 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.live import Live, Tracker, open_sink, open_source
 from phasemark.matcher.live.map_tracker import MapTracker
-from phasemark.matcher.live.rig_frames import open_rig_source
+from phasemark.matcher.live.rig_frames import RigLines, open_rig_source
 from phasemark.matcher.live.search_beside import SearchesInLine
 from phasemark.matcher.live.sources import SourceFault
+from phasemark.matcher.live.streams import Stream
 from phasemark.matcher.live.tracker import Located
 from phasemark.matcher.locate import Locator, read_rig_recording, recording_bytes, simulated_recording
 from phasemark.matcher.sequence import Estimate, FreeMotion, PoseEstimator, Standing
@@ -586,6 +588,42 @@ def test_lines_of_a_rig_s_sensors_are_frames_and_unknown_or_silent_sensors_are_t
         with pytest.raises(UsageError, match=message):
             run(open_rig_source(board.on_terminal(), rig), _SlowLocator(0.0))
         board.unplug()
+
+
+def test_zones_of_another_mode_or_damaged_odometry_are_no_frames_and_a_strange_stream_is_told(tmp_path):
+    rig, file = ring_rig(4), tmp_path / "lines"
+    row = {"sensor": "s0", "distances": [1000] * 16, "t_ms": 1}
+    whole = {**row, "distances": [1000] * 64}
+    long = json.dumps(whole)[:-1] + ', "odometry": [1' + "0" * 400 + ", 0, 0]}"
+    for lines, message in ((json.dumps(row), "16 zones, the sensor has 8 × 8"), (long, "'odometry' must be")):
+        file.write_text(f"{lines}\n" * 3)
+        source = RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig)
+        assert list(source.frames()) == []
+        assert source.n_damaged == 3
+        assert message in source.damage
+    file.write_text("1, 2, 3\n" * 300)
+    with pytest.raises(UsageError, match="none of 256 lines is JSON with 'sensor' and 'distances'"):
+        list(RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig).frames())
+
+
+@pytest.mark.parametrize("kind", ["jsonl", "mcap"])
+def test_no_sink_writes_over_what_a_session_reads(tmp_path, capsys, kind):
+    wall_map, rig, _, drive = rig_drive()
+    for name, content in (("room.toml", wall_map.to_toml().encode()), ("rig.toml", rig.to_toml().encode()),
+                          ("drive.npz", recording_bytes(drive, rig))):  # fmt: skip
+        (tmp_path / name).write_bytes(content)
+    room_file, rig_file, frames = (str(tmp_path / name) for name in ("room.toml", "rig.toml", "drive.npz"))
+    words = ["live", frames, "--map", room_file, "--rig", rig_file, "--at-once", "--force"]
+    for file in (room_file, rig_file, frames):
+        before = Path(file).read_bytes()
+        assert main([*words, "--to", f"{kind}:{file}"]) == 2
+        assert "is an input too" in capsys.readouterr().err
+        assert Path(file).read_bytes() == before
+    out = str(tmp_path / "out")
+    assert main([*words, "--to", f"{kind}:{out}", "--to", f"jsonl:{out}"]) == 2
+    assert "each sink must have a file of its own" in capsys.readouterr().err
+    assert main([*words, "--flip-h"]) == 2
+    assert "go with --landmark" in capsys.readouterr().err
 
 
 @pytest.mark.soak

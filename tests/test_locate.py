@@ -196,6 +196,47 @@ def test_a_corridor_leaves_the_place_along_it_undetermined():
     assert math.sqrt(answer.covariance[1, 1]) < 0.02
 
 
+def test_a_robot_beyond_the_ends_of_walls_that_close_no_room_is_found_there():
+    corner, rig, rng = WallMap(walls_m=[[0, 0, 2, 0], [0, 0, 0, 1.5]]), ring_rig(4), np.random.default_rng(4)
+    poses = np.column_stack([rng.uniform(0.3, 0.8, 8), rng.uniform(1.55, 1.9, 8), rng.uniform(-3, 3, 8)])
+    recording = simulated_recording(corner, rig, poses, rng, time_s=np.arange(3) / 10)
+    answers = Locator(corner, rig).locate(recording)
+    for answer, pose in zip(answers, poses, strict=True):
+        assert answer.reason in ("", "undetermined", "ambiguous")
+        off = np.array([[one.x_m, one.y_m, one.yaw_rad] for one in answer.alternatives]) - pose
+        off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
+        assert (np.abs(off) < 0.25).all(axis=1).any()
+    assert any(answer.accepted for answer in answers)
+    right = [np.abs(one.pose[:2] - pose[:2]).max() < 0.1 for one, pose in zip(answers, poses, strict=True)]
+    assert all(right[k] for k, one in enumerate(answers) if one.accepted)
+    one_wall = WallMap(walls_m=[[0, 0, 2, 0]])  # its bounds have no area
+    recording = simulated_recording(one_wall, rig, [[1.0, 0.6, 0.2]], np.random.default_rng(0))
+    assert Locator(one_wall, rig).locate(recording)[0].reason == "undetermined"
+
+
+def test_a_room_that_is_not_in_the_map_is_not_taken_for_a_part_of_it():
+    other = WallMap(walls_m=[[0, 0, 3, 0], [3, 0, 3, 2], [3, 2, 0, 2], [0, 2, 0, 0]])
+    rig, rng = ring_rig(4), np.random.default_rng(6)
+    recording = simulated_recording(other, rig, free_poses(other, 24, rng), rng, time_s=np.arange(3) / 10)
+    answers = Locator(room(), rig).locate(recording)
+    assert sum(one.accepted for one in answers) <= 1  # 5 where a pose may explain less than 0.85 of the columns
+
+
+def test_the_outline_is_cut_where_the_sensors_are_and_not_the_robot():
+    low = {"x_m": 1.6, "y_m": 1.4, "size_m": [0.6, 0.4, 0.4]}  # which sensors at 0.6 m look over
+    one, rig, rng = room(box=[low], height_m=0.3), ring_rig(4), np.random.default_rng(7)
+    raised = rig.model_copy(update={"sensor": tuple(s.model_copy(update={"z_m": 0.3}) for s in rig.sensor)})
+    assert len(Locator(one, raised).model.outline.pieces) == len(Locator(room(), rig).model.outline.pieces)
+    assert len(Locator(one, rig).model.outline.pieces) == len(Locator(room(), rig).model.outline.pieces) + 4
+    mixed = rig.model_copy(update={"sensor": (*rig.sensor[:3], raised.sensor[3])})
+    with pytest.raises(UsageError, match=r"'z_m' of the sensors must be heights .* got 0 and 0\.3"):
+        Locator(one, mixed)
+    assert Locator(one, mixed, with_tilt=True).model.outline.pieces.shape[1] == 4
+    poses = free_poses(room(), 4, rng)
+    recording = simulated_recording(room(), rig, poses, rng)
+    assert all(answer.accepted for answer in Locator(one, raised).locate(recording, poses, (0.1, 0.1, 0.1)))
+
+
 def test_something_in_view_that_is_not_in_the_map_moves_no_pose_by_more_than_it_states():
     one, rig = room(wall=[POST]), ring_rig(4)
     recording = simulated_recording(one, rig, [[1.0, 0.8, 0.4]], np.random.default_rng(4))
@@ -349,5 +390,22 @@ def test_the_command_writes_a_line_a_stop(tmp_path: Path, capsys: pytest.Capture
         assert [line.split(",")[1] for line in lines[1:]] == ["0", "1", "2", "3"]
         assert Counter(line.split(",")[12] for line in lines[1:]) == {"1": 4}
     assert "accepted" in capsys.readouterr().out
+    for changed, message in (
+        ("stop,x_m,y_m,yaw_deg\n\n0,1,1,zwei", "line 3"),
+        ("stop,x_m,y_m,yaw_deg\n0,1,1,0\n0,1,2,0", "a second pose of stop 0"),
+        ("stop,x_m,y_m,yaw_deg\n0.5,1,1,0", "must be whole, got 0.5"),
+        ("stop,x_m,y_m,x_m,yaw_deg\n0,1,1,1,0", "two columns have the same name"),
+        ("stop,x_m,y_m,yaw_deg\n77,1,1,0", "has no pose of 'simulated', whose first stop is 0"),
+    ):
+        (tmp_path / "wrong.csv").write_text(changed)
+        assert main(["locate", *files, "--start", str(tmp_path / "wrong.csv"), "-o", str(out), "--force"]) == 3
+        assert message in capsys.readouterr().err
+    for std in ("0", "nan", "-0.3"):
+        assert main(["locate", *files, "--odometry", f"--start-std={std}", "-o", str(out), "--force"]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
+    two = "\n".join(f"[maps.{name}]\nwalls_m = {[list(map(float, w.ends_m)) for w in one.walls]}" for name in "ab")
+    (tmp_path / "two.toml").write_text(f'runs.{recording.run} = "b"\n{two}')
+    assert main(["locate", str(tmp_path / "two.toml"), *files[1:], "--odometry", "-o", str(out), "--force"]) == 0
+    capsys.readouterr()
     assert main(["locate", *files, "--frames", "9", "-o", str(out), "--force"]) == 2
     assert "'frames' must be 1 … 1" in capsys.readouterr().err.replace("--frames", "'frames'")

@@ -52,6 +52,7 @@ CASES = {
     "frames simulate": ("part.stl", "out.csv", "--mesh p=part.stl --unit m --out out.csv"),
     "frames show": ("frames.csv", "out.png", "frames.csv --unit m --quantity z --out out.png"),
     "calibrate": ("frames.csv", "out.png", "cone frames.csv --poses p.csv --out out.toml"),
+    "live": ("frames.csv", "out.jsonl", "frames.csv --landmark cone --to jsonl:out.jsonl"),
     "locate": ("frames.csv", "out.csv", "cam.toml cam.toml frames.csv --out out.csv"),
     "sweep run": ("sweep.toml", "dir/cells.csv", "sweep.toml --out dir"),
     "drive": ("drive.toml", "dir/path.csv", "drive.toml --out dir"),

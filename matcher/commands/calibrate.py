@@ -152,6 +152,8 @@ def calibrate_camera(
     from phasemark.matcher.calibration.known_poses import read_poses
 
     if rig_file is not None:
+        if fix is not None or sensor is not None or reading != FrameReading():
+            raise UsageError("--fix, --sensor and options of how frames are read do not go with --rig")
         files, chosen = [Path(bank_or_class), *(frames or ())], None if free is None else _names(free)
         return calibrate_rig_file(rig_file, map_file, files, poses, chosen, out, write_distrusted, force, as_json)
     if not frames:

@@ -18,6 +18,7 @@ from phasemark.data.commands.command import Shown, Without
 from phasemark.data.commands.console import LongWork, echo_json, tell
 from phasemark.data.commands.inputs import open_any_bank, read_landmark, read_sensor
 from phasemark.data.commands.options import Force, FrameReading, Json, MeshReading, SensorName
+from phasemark.data.commands.outputs import refuse_input_files
 from phasemark.matcher.commands.match_options import Landmark, Search
 
 if TYPE_CHECKING:
@@ -108,14 +109,18 @@ def live_poses(
         Replay a recording as fast as it is matched, each search in line.
     """
     from phasemark.matcher.live import Live, open_sink, open_source
+    from phasemark.matcher.live.openers import files_of_sinks
 
     motion.check()
+    refuse_input_files(files_of_sinks(to or []))
     with ExitStack() as stack:
         if landmark_name is not None and map_file is None and rig_file is None:
             shown: Bank | None = (bank := stack.enter_context(_bank(landmark_name, mesh, sensor, distance)))
             found = open_source(source, bank.camera, vars(reading), in_time=not at_once)
             make: Any = partial(_tracker, bank, search, motion, found)
         elif landmark_name is None and map_file is not None and rig_file is not None:
+            if reading != FrameReading():
+                raise UsageError("options of how frames are read go with --landmark: a rig's frames say it themselves")
             shown = None
             found, make = _among_walls(source, rig_file, map_file, map_name, motion, not at_once)
         else:
@@ -130,7 +135,17 @@ def live_poses(
         if as_json:
             echo_json({"status": session.status.as_dict()})
         else:
-            tell(f"note: {session.status.frames} frames, {session.status.accepted} poses published")
+            tell(f"note: {session.status.frames} frames, {session.status.accepted} poses published{_lost(session)}")
+
+
+def _lost(session: Live) -> str:
+    """Return how many frames were not located, and why those that were damaged are."""
+    status, source, words = session.status, session.source, ""
+    if status.dropped:
+        words += f"; {status.dropped} dropped for newer ones"
+    if source.n_damaged:
+        words += f"; {source.n_damaged} damaged: {source.damage}"
+    return words
 
 
 def _among_walls(
@@ -140,11 +155,13 @@ def _among_walls(
     from phasemark.matcher.live.map_tracker import MapTracker
     from phasemark.matcher.live.rig_frames import RecordedRig, open_rig_source
     from phasemark.matcher.locate import Locator, read_rig, read_wall_map
+    from phasemark.matcher.locate.wall_map import map_of_run
 
     rig = read_rig(rig_file)
     found = open_rig_source(source, rig, in_time=in_time)
     recorded_in = found.recording.map_name if isinstance(found, RecordedRig) else None
-    wall_map = read_wall_map(map_file, map_name or recorded_in)
+    run = found.recording.run if isinstance(found, RecordedRig) else None
+    wall_map = read_wall_map(map_file, map_of_run(map_file, map_name or recorded_in, run))
     return found, lambda: MapTracker(Locator(wall_map, rig), motion.speed, math.radians(motion.turn_rate))
 
 

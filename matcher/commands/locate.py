@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
@@ -89,7 +90,7 @@ def locate_rig(
     from phasemark.matcher.locate.pose_table import pose_csv
     from phasemark.matcher.locate.recording import read_rig_recording
     from phasemark.matcher.locate.rig import read_rig
-    from phasemark.matcher.locate.wall_map import read_wall_map
+    from phasemark.matcher.locate.wall_map import map_of_run, read_wall_map
 
     refuse_other_files(out, ".csv", "the table")
     if plot is not None:
@@ -101,7 +102,7 @@ def locate_rig(
         for path in recordings:
             recording = read_rig_recording(path, rig)
             recording = recording if frames is None else recording.first_frames(frames)
-            wall_map = read_wall_map(map_file, map_name or recording.map_name)
+            wall_map = read_wall_map(map_file, map_of_run(map_file, map_name or recording.map_name, recording.run))
             limits = {"tolerance_m": tolerance, "tolerance_rad": math.radians(tolerance_yaw)}
             locator = Locator(wall_map, rig, with_tilt=tilt, **limits)
             found = _located(locator, recording, start, odometry, std, smooth)
@@ -130,6 +131,8 @@ def _located(
     from phasemark.matcher.locate.smoothing import smoothed
 
     starts = None if start is None else poses_of(recording, read_stop_poses(start))
+    if starts is not None and all(math.isnan(pose[0]) for pose in starts):
+        raise InputFileError(f"{start}: has no pose of '{recording.run}', whose first stop is {recording.key(0)[1]}")
     if odometry:
         first = {}
         if starts is not None:
@@ -189,7 +192,9 @@ def calibrate_rig_file(
     rig = read_rig(rig_file)
     read = [read_rig_recording(path, rig) for path in recordings]
     maps, names = _maps(map_file, read)
-    beside = [out.with_name(f"{out.stem}-{name}.toml") for name in names] if "walls" in (free or ()) else []
+    moved_maps = names if "walls" in (free or ()) else {}
+    plain = [re.sub(r"[^\w.-]", "_", name) for name in moved_maps]
+    beside = [out.with_name(f"{out.stem}-{name}.toml") for name in plain]
     refuse_existing(beside, force)
     with LongWork("calibrating the rig") as progress:
         found = calibrate_rig(rig, read, maps, _poses(poses, read), tuple(free or FREE), progress)
@@ -209,13 +214,11 @@ def calibrate_rig_file(
 
 def _maps(map_file: Path, recordings: Sequence[RigRecording]) -> tuple[list[WallMap], dict[str, WallMap]]:
     """Return the map of each recording, and each map by its name."""
-    from phasemark.matcher.locate.wall_map import read_wall_map
+    from phasemark.matcher.locate.wall_map import map_of_run, read_wall_map
 
-    by_name: dict[str, WallMap] = {}
-    for recording in recordings:
-        name = recording.map_name or "map"
-        by_name.setdefault(name, read_wall_map(map_file, recording.map_name))
-    return [by_name[recording.map_name or "map"] for recording in recordings], by_name
+    names = [map_of_run(map_file, recording.map_name, recording.run) for recording in recordings]
+    by_name = {name or "map": read_wall_map(map_file, name) for name in dict.fromkeys(names)}
+    return [by_name[name or "map"] for name in names], by_name
 
 
 def _poses(tables: Sequence[Path], recordings: Sequence[RigRecording]) -> list[NDArray]:  # type: ignore[type-arg]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from phasemark.matcher.live.sources import PrintedSource, RecordedSource, Source
 from phasemark.matcher.live.streams import open_stream
 from phasemark.render import Sensor
 
+_FILES = "jsonl", "mcap"
 _SINKS = "jsonl:FILE, ros:NAME, mavlink:ADDRESS, mcap:FILE or foxglove://HOST:PORT"
 
 
@@ -56,6 +57,20 @@ def open_source(name: str, sensor: Sensor, how: Mapping[str, Any] | None = None,
     if Path(name).suffix == ".mcap":
         return McapSource(Path(name), sensor, in_time=in_time)
     return RecordedSource(Path(name), sensor, how, in_time=in_time)
+
+
+def files_of_sinks(names: Sequence[str]) -> list[Path]:
+    """Return the files that sinks of these names write.
+
+    Raises
+    ------
+    UsageError
+        Two of them write the same file.
+    """
+    files = [Path(rest) for kind, _, rest in (name.partition(":") for name in names) if kind in _FILES and rest]
+    if len(twice := {file.resolve() for file in files}) < len(files):
+        raise UsageError(f"each sink must have a file of its own, got {len(files)} for {', '.join(map(str, twice))}")
+    return files
 
 
 def open_sink(name: str, sensor: Sensor | None, *, force: bool = False) -> Sink:

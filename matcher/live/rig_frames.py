@@ -13,6 +13,7 @@ import numpy as np
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.measured.board_prints import of_object, plain
+from phasemark.data.plans.bank_plan import sensor_of
 from phasemark.matcher.live.sources import LONGEST_LINE, Arrival, Replay, StreamSource
 from phasemark.matcher.live.streams import Lines, Stream, open_stream
 from phasemark.matcher.locate import Rig, RigRecording, read_rig_recording
@@ -20,6 +21,8 @@ from phasemark.matcher.locate.recording import rig_recording
 
 _SILENT_FRAMES = 20
 """Frames after which a sensor that none has named is missed."""
+_MOST_OTHER_LINES = 256
+"""Lines that are not a sensor's before the first one that is."""
 _BETWEEN_STOPS_S = 1.0
 """Time between stops whose recording has none."""
 
@@ -39,12 +42,19 @@ class RigLines(StreamSource):
     def __init__(self, stream: Stream, rig: Rig) -> None:
         super().__init__(stream)
         self._rig, self._heard, self._n_frames = rig, set[str](), 0
+        self._rows = max(sensor_of(one.preset, {}).rows for one in rig.sensor)
 
     def _parsed(self, lines: Lines) -> Iterator[Arrival]:
         held: dict[str, dict[str, Any]] = {}
+        n_other = 0
         while line := lines.readline(LONGEST_LINE):
             text = plain(line)
             if not text.startswith("{"):
+                n_other += 1
+                if n_other == _MOST_OTHER_LINES and not self._heard:
+                    raise UsageError(
+                        f"{self.name}: none of {n_other} lines is JSON with 'sensor' and 'distances', as of a rig"
+                    )
                 continue
             try:
                 row = self._row(text)
@@ -62,9 +72,9 @@ class RigLines(StreamSource):
     def _row(self, text: str) -> dict[str, Any]:
         """Return what a line holds: the sensor, zones in metres, their status, a time and the odometry, if any."""
         printed, columns = of_object(0, text), int(self._rig.numbers().columns.max())
-        n = len(printed.distance_mm)
-        if printed.damage or not n or n % columns:
-            raise InputFileError(f"{self.name}: {printed.damage or f'{n} zones, must be rows of {columns}'}")
+        n, rows = len(printed.distance_mm), self._rows
+        if printed.damage or n not in (columns, rows * columns):
+            raise InputFileError(f"{self.name}: {printed.damage or f'{n} zones, the sensor has {rows} × {columns}'}")
         given = json.loads(text)
         name, odometry = given.get("sensor"), given.get("odometry")
         if name not in self._rig.names:
@@ -72,7 +82,7 @@ class RigLines(StreamSource):
         if odometry is not None:
             try:
                 odometry = np.array(odometry, np.float64).reshape(3) * [1, 1, np.radians(1)]
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 raise InputFileError(f"{self.name}: 'odometry' must be [x_m, y_m, yaw_deg]") from None
         shape = (n,) if n == columns else (n // columns, columns)
         status = printed.status or [self._rig.reduction.valid_status[0]] * n

@@ -182,6 +182,10 @@ class Live:
         try:
             act(sink)
         except OSError as error:
+            if isinstance(error, BrokenPipeError) and sink.name == "-":  # nobody reads standard output any more
+                self._error.append(error)
+                self._stop.set()
+                return
             line = f"{sink.name}: {error.strerror or error}"
             if line != self._said:
                 self._said = line

@@ -32,6 +32,10 @@ _NARROW = 2.0, 1.0
 """Noise of the rounds of a descent from near a pose, in that of the rig."""
 _HOPELESS = 4 * DISAGREEMENT
 """Cost by which a start may exceed the best one after a descent on three frames."""
+_LEAST_ALONE = 0.85
+"""Least share that an accepted pose must explain if no start speaks for it: rooms that look alike explain 0.8."""
+_LEAST_STD = 1e-6
+"""Smallest standard deviation of a start, m and rad."""
 _REACH_SIGMA = 3.5
 """Half the width of the region that is searched around a prior, in its standard deviations."""
 
@@ -136,7 +140,7 @@ class Locator:
         How far off an accepted pose may be: three standard deviations must be within it, and no other pose that
         explains the stop may be farther away.
     least_explained : float
-        Share of the observed columns that an accepted pose must explain.
+        Share of the observed columns that an accepted pose must explain; at least 0.85 where no start speaks for it.
     with_tilt : bool
         Whether height, pitch and roll are estimated, too, from the zones of recordings with rows: from the poses that
         the columns have found, in the scene of the map. An answer is accepted by x, y and yaw.
@@ -144,7 +148,7 @@ class Locator:
     Raises
     ------
     UsageError
-        A tolerance that is not positive, a share outside (0, 1).
+        A tolerance that is not positive, a share outside (0, 1), sensors that see different faces of the map.
 
     Examples
     --------
@@ -170,8 +174,8 @@ class Locator:
             raise UsageError(f"'least_explained' must be in (0, 1), got {least_explained!r}")
         self.tolerance_m, self.tolerance_rad, self.least_explained = tolerance_m, tolerance_rad, least_explained
         self.wall_map, self.rig = wall_map, rig
-        self.model = StopModel(rig, wall_map.outline(), rig.numbers())
-        self._grid = pose_grid(self.model.outline)
+        self.model = StopModel(rig, rig.outline_of(wall_map, in_space=with_tilt), rig.numbers())
+        self._grid = pose_grid(self.model.outline, rig.noise.max_range_m)
         self.with_tilt = with_tilt
         self._in_space: dict[int, SpaceModel] = {}
 
@@ -206,9 +210,7 @@ class Locator:
         starts = np.full((n, 3), np.nan) if start is None else np.asarray(start, np.float64)
         if starts.shape != (n, 3):
             raise UsageError(f"'start' must be {(n, 3)}, one pose a stop, got {starts.shape}")
-        std = np.broadcast_to(np.asarray(start_std, np.float64), (n, 3))
-        if not (np.isfinite(std).all() and (std > 0).all()):
-            raise UsageError("'start_std' must be positive")
+        std = _positive(start_std, (n, 3))
         return [
             self._located(recording, k, (starts[k], np.diag(std[k] ** 2)) if np.isfinite(starts[k]).all() else None)
             for k in range(n)
@@ -238,13 +240,13 @@ class Locator:
         Raises
         ------
         UsageError
-            The recording has no odometry.
+            The recording has no odometry, or standard deviations are not positive.
         """
         if recording.odometry is None:
             raise UsageError(
                 "the recording must have odometry at its stops: odometry_x_m, odometry_y_m, odometry_yaw_rad"
             )
-        first = np.diag(np.square(np.asarray(start_std, np.float64)))
+        first = np.diag(np.square(_positive(start_std, (3,))))
         answers: dict[int, LocatedPose] = {}
         for robot in np.unique(recording.robot):
             own = np.flatnonzero(recording.robot == robot)
@@ -346,8 +348,8 @@ class Locator:
         return fits
 
     def _distinct(self, fits: list[StopFit]) -> list[StopFit]:
-        """Return fits that are within the map, best first, one of those that have nearly the same pose."""
-        low_x, low_y, high_x, high_y = self.model.outline.bounds_m
+        """Return fits at places where a robot may be, best first, one of those that have nearly the same pose."""
+        low_x, low_y, high_x, high_y = self._grid.bounds_m
         kept: list[StopFit] = []
         for fit in sorted(fits, key=lambda one: one.cost):
             x, y, _ = fit.pose
@@ -381,8 +383,9 @@ class Locator:
             candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
+        least = self.least_explained if prior is not None else max(self.least_explained, _LEAST_ALONE)
         reason = self._reason(
-            fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(model, scan, best) ** 2)
+            least, fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(model, scan, best) ** 2)
         )
         return LocatedPose(
             ("", 0, 0),
@@ -406,9 +409,9 @@ class Locator:
             return None
         return fit.theta[first:] + np.array([self.wall_map.height_m, 0.0, 0.0]), fit.covariance[first:, first:]
 
-    def _reason(self, fits: list[StopFit], near: list[int], std: _Float) -> LocateReason:
-        """Return why the best fit is refused; empty where it is accepted."""
-        if fits[0].share < self.least_explained:
+    def _reason(self, least: float, fits: list[StopFit], near: list[int], std: _Float) -> LocateReason:
+        """Return why the best fit, which must explain a least share, is refused; empty where it is accepted."""
+        if fits[0].share < least:
             return "poor fit"
         if not self.is_determined(std):
             return "undetermined"
@@ -417,6 +420,14 @@ class Locator:
             if (off + TOLERATED_SIGMA * np.sqrt(np.diag(other.covariance)[:3]) > self._tolerance).any():
                 return "ambiguous"
         return ""
+
+
+def _positive(start_std: ArrayLike, shape: tuple[int, ...]) -> _Float:
+    """Return standard deviations of starts in a shape."""
+    std = np.broadcast_to(np.asarray(start_std, np.float64), shape)
+    if not (np.isfinite(std) & (std >= _LEAST_STD)).all():
+        raise UsageError(f"'start_std' must be at least {_LEAST_STD:g}, got {np.min(std):g}")
+    return std
 
 
 def _given(prior: tuple[_Float, _Float] | None) -> tuple[_Float, _Float] | None:

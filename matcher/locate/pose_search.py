@@ -32,20 +32,35 @@ class PoseGrid(NamedTuple):
     spacing_m: float
     shape: tuple[int, int]
     """Nodes along x and along y."""
+    bounds_m: tuple[float, float, float, float]
+    """Least x and y, greatest x and y, where a robot may be."""
     range_m: NDArray[np.float32]
     """(nodes, directions): of equal angles, the first along x; infinite where no wall is."""
 
 
-def pose_grid(outline: Outline) -> PoseGrid:
-    """Compute the ranges around the nodes of a grid over the bounds of a map."""
+def pose_grid(outline: Outline, reach_m: float) -> PoseGrid:
+    """Compute the ranges around the nodes of a grid of all places where a robot may be.
+
+    These are the bounds of a map that walls close; others by `reach_m` beyond, from where a sensor sees them still.
+    """
+    grid = _grid_over(outline, outline.bounds_m)
+    inside = grid.range_m.reshape(*grid.shape, -1)[1:-1, 1:-1]  # others may stand in the walls
+    ahead = np.isinf(inside)
+    if inside.size and not (ahead & np.roll(ahead, 1, axis=2)).any():  # one direction alone passes between two walls
+        return grid
     low_x, low_y, high_x, high_y = outline.bounds_m
+    return _grid_over(outline, (low_x - reach_m, low_y - reach_m, high_x + reach_m, high_y + reach_m))
+
+
+def _grid_over(outline: Outline, bounds_m: tuple[float, float, float, float]) -> PoseGrid:
+    low_x, low_y, high_x, high_y = bounds_m
     spacing = max(_SPACING_M, math.sqrt((high_x - low_x) * (high_y - low_y) / _MOST_NODES))
     shape = (int((high_x - low_x) / spacing) + 1, int((high_y - low_y) / spacing) + 1)
     corner = (low_x + 0.5 * ((high_x - low_x) - (shape[0] - 1) * spacing),
               low_y + 0.5 * ((high_y - low_y) - (shape[1] - 1) * spacing))  # fmt: skip
     range_m = np.empty((shape[0] * shape[1], _DIRECTIONS), np.float32)
     _ranges(outline.pieces, corner, spacing, shape[1], range_m)
-    return PoseGrid(corner, spacing, shape, range_m)
+    return PoseGrid(corner, spacing, shape, bounds_m, range_m)
 
 
 def promising_poses(

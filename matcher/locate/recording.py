@@ -340,14 +340,17 @@ def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], 
         The file cannot be read, a column is missing, or a value is no number; with file, line and column.
     """
     path = Path(path)
-    lines = [line for line in read_text(path, most_bytes=_MOST_BYTES).splitlines() if line.strip()]
-    header = [name.strip() for name in cells_of(lines[0], f"{path}, line 1")] if lines else []
+    text = read_text(path, most_bytes=_MOST_BYTES).splitlines()
+    lines = [(number, line) for number, line in enumerate(text, 1) if line.strip()]
+    header = [name.strip() for name in cells_of(lines[0][1], f"{path}, line {lines[0][0]}")] if lines else []
+    if len(set(header)) < len(header):
+        raise InputFileError(f"{path}: two columns have the same name, got {', '.join(header)}")
     for needed in ("stop", "x_m", "y_m", "yaw_deg"):
         if needed not in header:
             raise InputFileError(f"{path}: no column '{needed}', got {', '.join(header) or 'nothing'}")
     found = {}
     robot_key = "drone" if "drone" in header else "robot"
-    for number, line in enumerate(lines[1:], 2):
+    for number, line in lines[1:]:
         where = f"{path}, line {number}"
         cells = cells_of(line, where)
         if len(cells) != len(header):
@@ -359,7 +362,12 @@ def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], 
         if np.isnan([x, y, yaw, stop]).any() or row.get("accepted", "1").strip().lower() in ("0", "false", "no"):
             continue
         robot = finite_number(row.get(robot_key, "0"), where, robot_key)
-        found[row.get("run", "").strip(), int(stop), int(robot)] = np.array([x, y, np.radians(yaw)])
+        key = row.get("run", "").strip(), int(stop), int(robot)
+        if key[1:] != (stop, robot):
+            raise InputFileError(f"{where}: numbers of stops and robots must be whole, got {stop:g} and {robot:g}")
+        if key in found:
+            raise InputFileError(f"{where}: a second pose of stop {key[1]}")
+        found[key] = np.array([x, y, np.radians(yaw)])
     return found
 
 

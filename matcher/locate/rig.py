@@ -14,8 +14,9 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel, read_plan, sensor_in_folder, sensor_of
-from phasemark.matcher.locate.kernel_arguments import RigNumbers
+from phasemark.matcher.locate.kernel_arguments import Outline, RigNumbers
 from phasemark.matcher.locate.plane import turn_of
+from phasemark.matcher.locate.wall_map import WallMap
 
 _Float = NDArray[np.float64]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -204,6 +205,30 @@ class Rig(PlanModel):
                          columns, one.footprint_columns))  # fmt: skip
         yaw, x, y, delay, offset, gain, steps, n, footprint = np.array(rows, dtype=np.float64).T.copy()
         return RigNumbers(yaw, x, y, delay, offset, gain, steps, n.astype(np.int64), footprint)
+
+    def outline_of(self, wall_map: WallMap, *, in_space: bool = False) -> Outline:
+        """Return the faces of a map that the sensors see, those of all.
+
+        Parameters
+        ----------
+        wall_map : WallMap
+        in_space : bool
+            Whether it is that of starts alone, and what sensors of several heights see comes after.
+
+        Raises
+        ------
+        UsageError
+            Nothing of the map is as high as the sensors, or sensors of different heights see different faces.
+        """
+        heights = sorted({one.z_m for one in self.sensor})
+        outlines = [wall_map.outline(height) for height in heights]
+        for height, outline in zip(heights, outlines, strict=True):
+            if not (in_space or np.array_equal(outline.pieces, outlines[0].pieces)):
+                raise UsageError(
+                    f"'z_m' of the sensors must be heights at which the map has the same faces unless height and tilt"
+                    f" are estimated, got {heights[0]:g} and {height:g}"
+                )
+        return outlines[len(outlines) // 2]
 
     def row_steps_rad(self) -> _Float:
         """Return the angle between neighbouring rows of each sensor, (S,), in the proportion of its preset."""

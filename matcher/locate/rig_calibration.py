@@ -205,7 +205,7 @@ class _Problem:
             std /= _unit(name, self.start)
             blocks[name] = std[:1] if one.common else std
         blocks |= dict.fromkeys(self.groups, _MARKER_STD)
-        for m, outline in enumerate([one.outline() for one in self.maps] if walls else []):
+        for m, outline in enumerate([self.rig.outline_of(one) for one in self.maps] if walls else []):
             if not (outline.std_m > 0).any():
                 raise UsageError("'std_m' of a map's walls must be positive where walls are free")
             blocks["walls", m] = outline.std_m
@@ -235,7 +235,7 @@ class _Problem:
         for m, one in enumerate(self.maps):
             if ("walls", m) in self.place:
                 one = one.with_walls_moved(self.value[self.place["walls", m]][: len(one.walls)])
-            models.append(StopModel(self.rig, one.outline(), self.numbers))
+            models.append(StopModel(self.rig, self.rig.outline_of(one), self.numbers))
         added = np.array([self._add(stop, models[self.of_map[stop[0]]]) for stop in self.stops])
         squares, count, explained = added.sum(axis=0)
         self.explained = explained / len(self.stops)

@@ -50,7 +50,7 @@ def simulated_recording(
     """
     truth, times = np.asarray(poses, np.float64), np.asarray(time_s, np.float64)
     track = np.zeros((len(times), 3)) if moved is None else np.asarray(moved, np.float64)
-    parts, noise, rows = (rig, wall_map.outline(), rig.numbers()), rig.noise, 1
+    parts, noise, rows = (rig, rig.outline_of(wall_map, in_space=truth.shape[1] == 6), rig.numbers()), rig.noise, 1
     model = StopModel(*parts)
     if truth.shape[1] == 6:
         rows = max(sensor_of(one.preset, {}).rows for one in rig.sensor)

@@ -259,24 +259,28 @@ class WallMap(PlanModel):
         meshes = tuple(one.model_copy(update={"file": str(folder / one.file)}) for one in self.mesh)
         return self.model_copy(update={"mesh": meshes})
 
-    def outline(self) -> Outline:
+    def outline(self, above_m: float = 0.0) -> Outline:
         """Return the faces that sensors see.
+
+        Parameters
+        ----------
+        above_m : float
+            Of the sensors above the robot's height.
 
         Raises
         ------
         UsageError
             Nothing of the map is as high as the sensors.
         """
-        walls = self.walls
-        bodies = self._bodies
-        seen = [wall.base_m <= self.height_m <= wall.base_m + wall.height_m for wall in walls]
+        walls, bodies, height = self.walls, self._bodies, self.height_m + above_m
+        seen = [wall.base_m <= height <= wall.base_m + wall.height_m for wall in walls]
         groups = [wall.outline() if high else np.empty((0, 4)) for wall, high in zip(walls, seen, strict=True)]
-        groups += [body.outline(self.height_m) for body in bodies]
+        groups += [body.outline(height) for body in bodies]
         normals = [*(wall.normal for wall in walls), *(np.zeros(2) for _ in bodies)]
         stds = [*(wall.std_m for wall in walls), *(0.0 for _ in bodies)]
         pieces = np.concatenate(groups)
         if not len(pieces):
-            raise UsageError(f"'height_m' must be a height at which the map has walls or bodies, got {self.height_m:g}")
+            raise UsageError(f"'height_m' must be a height at which the map has walls or bodies, got {height:g}")
         owner = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
         pieces, of = cut_at_crossings(pieces)
         return Outline(pieces, owner[of], np.array(normals), np.array(stds))
@@ -305,6 +309,12 @@ class WallMap(PlanModel):
         for key in sorted(content, key=lambda name: isinstance(content[name], list)):
             document.add(key, tomlkit.item(content[key]))
         return tomlkit.dumps(document)
+
+
+def map_of_run(path: str | os.PathLike[str], name: str | None, run: str | None) -> str | None:
+    """Return the name of a map in a file: the one that is given, or that of ``runs.RUN``; None where neither is."""
+    runs: Any = read_toml(Path(path)).get("runs")
+    return runs.get(run) if name is None and isinstance(runs, dict) else name
 
 
 def read_wall_map(path: str | os.PathLike[str], name: str | None = None) -> WallMap:

@@ -184,9 +184,9 @@ def make_patches(
     """Cut the surfaces of a scene into patches.
 
     Faces are cut along the outlines of bodies that stand on them, and then in two across their longest edge until none
-    is too long: what lies beside a body is as small as `size_at` says of that place, and not of one below it. Facets that lie beside one another and face alike are
-    joined, so that a curved mesh of many faces has few patches. A part of a surface inside a closed body, as the floor
-    below a box, has none.
+    is too long: what lies beside a body is as small as `size_at` says of that place, and not of one below it. Facets
+    that lie beside one another and face alike are joined, so that a curved mesh of many faces has few patches. A part
+    of a surface inside a closed body, as the floor below a box, has none.
 
     Parameters
     ----------
