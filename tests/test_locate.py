@@ -202,7 +202,7 @@ def test_a_robot_beyond_the_ends_of_walls_that_close_no_room_is_found_there():
     recording = simulated_recording(corner, rig, poses, rng, time_s=np.arange(3) / 10)
     answers = Locator(corner, rig).locate(recording)
     for answer, pose in zip(answers, poses, strict=True):
-        assert answer.reason in ("", "undetermined", "ambiguous")
+        assert answer.reason in ("", "undetermined", "poor fit")  # of some 27 columns, three may be outliers
         off = np.array([[one.x_m, one.y_m, one.yaw_rad] for one in answer.alternatives]) - pose
         off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
         assert (np.abs(off) < 0.25).all(axis=1).any()
@@ -219,7 +219,7 @@ def test_a_room_that_is_not_in_the_map_is_not_taken_for_a_part_of_it():
     rig, rng = ring_rig(4), np.random.default_rng(6)
     recording = simulated_recording(other, rig, free_poses(other, 24, rng), rng, time_s=np.arange(3) / 10)
     answers = Locator(room(), rig).locate(recording)
-    assert sum(one.accepted for one in answers) <= 1  # 5 where a pose may explain less than 0.85 of the columns
+    assert sum(one.accepted for one in answers) <= 1  # 5 where a pose may explain less of the columns
 
 
 def test_the_outline_is_cut_where_the_sensors_are_and_not_the_robot():

@@ -32,8 +32,9 @@ _NARROW = 2.0, 1.0
 """Noise of the rounds of a descent from near a pose, in that of the rig."""
 _HOPELESS = 4 * DISAGREEMENT
 """Cost by which a start may exceed the best one after a descent on three frames."""
-_LEAST_ALONE = 0.85
-"""Least share that an accepted pose must explain if no start speaks for it: rooms that look alike explain 0.8."""
+_MOST_OUTLIERS = 2.0
+"""Outliers of a pose that no start speaks for, in those of the rig's noise: another room explains four columns of five.
+"""
 _LEAST_STD = 1e-6
 """Smallest standard deviation of a start, m and rad."""
 _REACH_SIGMA = 3.5
@@ -140,7 +141,8 @@ class Locator:
         How far off an accepted pose may be: three standard deviations must be within it, and no other pose that
         explains the stop may be farther away.
     least_explained : float
-        Share of the observed columns that an accepted pose must explain; at least 0.85 where no start speaks for it.
+        Share of the observed columns that an accepted pose must explain; where no start speaks
+        for it, at least all but twice the outliers of the rig's noise.
     with_tilt : bool
         Whether height, pitch and roll are estimated, too, from the zones of recordings with rows: from the poses that
         the columns have found, in the scene of the map. An answer is accepted by x, y and yaw.
@@ -383,7 +385,9 @@ class Locator:
             candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
-        least = self.least_explained if prior is not None else max(self.least_explained, _LEAST_ALONE)
+        least = self.least_explained
+        if prior is None:
+            least = max(least, 1 - _MOST_OUTLIERS * self.rig.noise.outliers)
         reason = self._reason(
             least, fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(model, scan, best) ** 2)
         )
