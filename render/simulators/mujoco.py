@@ -198,10 +198,10 @@ class TofSensor:
         UsageError
             The seed is negative.
         """
+        if seed is not None and seed < 0:
+            raise UsageError(f"'seed' must not be negative, got {seed!r}")
         self._cadence.restart()
         if seed is not None:
-            if seed < 0:
-                raise UsageError(f"'seed' must not be negative, got {seed!r}")
             self._seed, self._run = seed, -1
 
     def read(self, data: mujoco.MjData) -> TofReading:
