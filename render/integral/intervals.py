@@ -76,7 +76,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
     for i in range(strip.k + 1):
         a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
         near_left, near_right = a - left < FELT, right - b < FELT
-        limb, whole, width = near_left or near_right, near_left and near_right, b - a
+        limb, width = near_left or near_right, b - a
         a_low, b_low = _bounds(start, np.int64(0), i, strip, box, scratch)
         a_high, b_high = _bounds(stop, strip.n_slabs - 1, i, strip, box, scratch)
         extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
@@ -94,7 +94,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
         for piece in range(pieces):
             lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
             hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
-            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch, whole)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch)
             first, a_first, b_first = n, 0.0, 0.0
             for g in range(nodes):
                 s = s_a if g == 0 else s_b
@@ -154,10 +154,8 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gauss_rule(lo, hi, i, strip, box, scratch, whole):  # type: ignore[no-untyped-def]
+def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
-
-    However small it is, an interval from limb to limb of a body (`whole`) has two nodes: its light falls to all sides.
 
     Returns
     -------
@@ -198,8 +196,7 @@ def _gauss_rule(lo, hi, i, strip, box, scratch, whole):  # type: ignore[no-untyp
     length, side = box.s1 - box.s0, box.x1 - box.x0
     trifle = _TRIFLE * length * length * side * side
     narrow = 0.04  # strips narrower than this share of their box get one line
-    small = extent < narrow * length or m0 * extent * extent < trifle
-    if (small and not whole) or variance < 1e-12:
+    if extent < narrow * length or m0 * extent * extent < trifle or variance < 1e-12:
         return 1, m0, origin + mean, 0.0, 1.0
     skew = (m3 / m0 - mean * (3.0 * m2 / m0 - 2.0 * mean * mean)) / variance
     root = math.sqrt(skew * skew + 4.0 * variance)
