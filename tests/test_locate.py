@@ -232,6 +232,15 @@ def test_the_outline_is_cut_where_the_sensors_are_and_not_the_robot():
     with pytest.raises(UsageError, match=r"'z_m' of the sensors must be heights .* got 0 and 0\.3"):
         Locator(one, mixed)
     assert Locator(one, mixed, with_tilt=True).model.outline.pieces.shape[1] == 4
+    cone = room(landmark=[{"class": "cone", "x_m": 1.6, "y_m": 1.4, "z_m": 0.3}], height_m=0.32)
+    for lower_m in (0.002, 0.05):  # a slope shows less than the noise of a column, and more
+        low_one = rig.sensor[0].model_copy(update={"z_m": -lower_m})
+        tilted = rig.model_copy(update={"sensor": (low_one, *rig.sensor[1:])})
+        if lower_m < 0.01:
+            assert len(tilted.outline_of(cone).pieces) > 6
+        else:
+            with pytest.raises(UsageError, match="'z_m' of the sensors"):
+                tilted.outline_of(cone)
     poses = free_poses(room(), 4, rng)
     recording = simulated_recording(room(), rig, poses, rng)
     assert all(answer.accepted for answer in Locator(one, raised).locate(recording, poses, (0.1, 0.1, 0.1)))
