@@ -162,9 +162,31 @@ def _open_closed_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    """Unwind the stack, so that temporary files are removed, and exit like a process that the signal ended."""
+_MOST_WAITS = 30
+
+
+def _terminate(signum: int, frame: FrameType | None, waited: int = 0) -> None:
+    """Unwind the stack, so that temporary files are removed, and exit like a process that the signal ended.
+
+    An exception within an import would leave its lock taken, or a library would read it as a missing package: the
+    signal waits until imports are done, a tenth of a second at a time; in a module that hangs, three seconds.
+    """
+    if waited < _MOST_WAITS and _is_importing(frame) and hasattr(signal, "setitimer"):
+        signal.signal(signal.SIGALRM, lambda _, then: _terminate(signum, then, waited + 1))
+        signal.setitimer(signal.ITIMER_REAL, 0.1)
+        return
+    if signum == signal.SIGINT:
+        raise KeyboardInterrupt
     raise SystemExit(128 + signum)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Return True if an import is on the stack."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _run(arguments: list[str]) -> None:
@@ -210,6 +232,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Python prints its traceback and exits with 1.
     """
     signal.signal(signal.SIGTERM, _terminate)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # nobody has it ignored
+        signal.signal(signal.SIGINT, _terminate)
     _open_closed_streams()
     if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
         app(prog_name="phasemark")

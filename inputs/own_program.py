@@ -34,8 +34,7 @@ def imported_program(text: str, what: str) -> Callable[..., Any]:
     try:
         found = getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as error:
-        if isinstance(error, SystemExit) and error.code == _TERMINATED:
-            raise
+        _pass_termination(error)
         failed = UsageError(f"{what} '{text}' cannot be imported ({named(error)})")
         if own := own_traceback(error):
             failed.add_note(own)
@@ -58,9 +57,16 @@ def called_program(text: str, error: BaseException, where: str) -> UsageError:
     where : str
         The call, and how it is repeated.
     """
+    _pass_termination(error)
     failed = UsageError(f"{where}: {text} raised {named(error)}")
     failed.add_note(own_traceback(error) or named(error))
     return failed
+
+
+def _pass_termination(error: BaseException) -> None:
+    """Raise an exception again if SIGTERM made it, and not the user's program."""
+    if isinstance(error, SystemExit) and error.code == _TERMINATED:
+        raise error
 
 
 def named(error: BaseException) -> str:

@@ -1,6 +1,8 @@
 """Generators of scenes as users write them, some of them bad, for the tests of frame sets."""
 
 import math
+import os
+import signal
 
 import numpy as np
 
@@ -105,3 +107,30 @@ def changes_a_mesh(index, rng):
     """The same mesh, another size each time: a bad habit, and noticed."""
     BLOCK.mesh.vertices = BLOCK.mesh.vertices * ((1.0 + 0.1 * index) / BLOCK.mesh.vertices[:, 0].max())
     return GeneratedScene(Scene([BLOCK]), np.eye(4), {}, at(3.0)[None])
+
+
+def brighter(index, rng):
+    """A wall of one mesh that sends back more from scene to scene."""
+    wall = Body(WALL.mesh, 0.5, "wall", retroreflecting=float(index))
+    return GeneratedScene(Scene([wall]), np.eye(4), {"index": index}, at(1.0)[None])
+
+
+def no_labels(index, rng):
+    return GeneratedScene(Scene([WALL]), np.eye(4), None, at(1.0)[None])
+
+
+def half_a_letter(index, rng):
+    return one_wall(index, rng, what="\ud800")
+
+
+def too_large(index, rng):
+    return one_wall(index, rng, count=10**400)
+
+
+def text_of_two_lines(index, rng):
+    return one_wall(index, rng, what="a b\n1,2,3 split=test")
+
+
+def is_terminated(index, rng):
+    os.kill(os.getpid(), signal.SIGTERM)
+    return one_wall(index, rng)

@@ -1,13 +1,16 @@
 """The frame of the command line: exit codes, one line for every mistake, output that other programs can read."""
 
+import importlib
 import io
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import textwrap
 import threading
+import time
 from pathlib import Path
 from typing import NoReturn
 
@@ -98,6 +101,32 @@ def test_an_operating_system_error_is_a_storage_error(run, monkeypatch):
 def test_an_interrupt_exits_with_130(run, monkeypatch):
     _fail_with(monkeypatch, KeyboardInterrupt())
     assert run("sensor", "show", "ideal") == (130, "", "error: interrupted\n")
+
+
+def test_a_signal_within_an_import_ends_the_program_after_it(tmp_path, monkeypatch):
+    """Libraries take what is raised in an import for a missing package, and go on."""
+    (tmp_path / "guarded.py").write_text(
+        "try:\n    import interrupted\nexcept BaseException:\n    interrupted = None\n"
+    )
+    (tmp_path / "interrupted.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.2)\nis_whole = True\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGALRM)}
+    signal.signal(signal.SIGTERM, cli._terminate)
+    try:
+        with pytest.raises(SystemExit) as caught:
+            _import_and_wait("guarded")
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert caught.value.code == 143
+    assert sys.modules["guarded"].interrupted.is_whole
+
+
+def _import_and_wait(module: str) -> None:
+    importlib.import_module(module)
+    time.sleep(5)
 
 
 def test_a_bug_of_ours_keeps_its_traceback(run, monkeypatch):

@@ -3,6 +3,7 @@
 import importlib
 import sys
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import mujoco
@@ -12,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from oracles.mujoco_rays import ray_images, ray_targets_m
 
 from phasemark import InputFileError, UsageError
-from phasemark.render import Scene, preset
+from phasemark.render import Scene, SceneRenderer, preset
 from phasemark.render.direct import HistogramFrames
 from phasemark.render.scene.mujoco_scene import seen_model
 from phasemark.render.simulators.cadence import Cadence
@@ -183,12 +184,26 @@ def test_a_file_of_a_model_becomes_a_scene(tmp_path, monkeypatch):
         Scene.read(older)
 
 
-def test_solids_of_a_body_that_overlap_are_one_without_inner_edges():
+def test_solids_of_a_body_that_overlap_fill_its_share_together():
     pair = '<geom size=".1" pos="0 -.05 0"/><geom size=".1" pos="0 .05 0"/><geom size=".1" pos="0 1 0"/>'
     sensor, data = in_mujoco(WALL + CAMERA + f'<body name="pair" pos="1 0 0"><freejoint/>{pair}</body>')
-    assert len(sensor.seen.bodies) == 3  # wall, pair, and the ball apart from it
     _, shares = ray_images(sensor.model, data, sensor.camera2world(data), sensor.sensor, np.ones(4), rays=4096)
     assert np.abs(sensor.read(data).truth.shares[..., 1] - shares[..., 1]).max() < 6e-3
+
+
+def test_the_curve_where_solids_of_a_body_meet_moves_with_it():
+    pair = '<geom type="capsule" size=".08 .1"/><geom size=".1" pos="0 .05 .1"/>'
+    sensor, data = in_mujoco(WALL + CAMERA + f'<body name="pair" pos="1 0 0"><freejoint/>{pair}</body>')
+    sensor.read(data)
+    for turn in ((0.9, 0.1, 0.3, 0.2), (0.5, 0.5, 0.5, 0.5)):
+        data.qpos[:7] = 0.8, 0.05, 0.02, *np.array(turn) / np.linalg.norm(turn)
+        mujoco.mj_forward(sensor.model, data)
+        poses = sensor.seen.poses(data, np.zeros(3))
+        bodies = [replace(body, pose=pose) for body, pose in zip(sensor.seen.bodies, poses, strict=True)]
+        camera = sensor.camera2world(data)
+        built = SceneRenderer(Scene(bodies), sensor.sensor).histograms(camera).signal
+        moved = sensor.renderer.histograms(camera, poses).signal
+        np.testing.assert_allclose(moved, built, rtol=1e-5)
 
 
 def test_a_body_that_trembles_by_less_than_a_micrometre_stands_still():
@@ -285,8 +300,12 @@ WRONG = {
     "albedo of a geom": (dict(albedo={"shell": -1}), "'albedo' of geom 'shell'"),
     "group": (dict(groups=(7,)), "'groups' must be numbers from 0 to 5"),
     "nothing": (dict(groups=(4,)), "no geom for the sensor to see"),
+    "one group": (dict(groups=3), "'groups' must be numbers from 0 to 5"),
     "rate": (dict(rate_hz=0), "'rate_hz' must be positive"),
-    "seed": (dict(seed=-1), "'seed' must not be negative"),
+    "rate as text": (dict(rate_hz="15"), "'rate_hz' must be positive"),
+    "seed": (dict(seed=-1), "'seed' must be a whole number, at least 0"),
+    "half a seed": (dict(seed=1.5), "'seed' must be a whole number, at least 0"),
+    "half a latency": (dict(latency_frames=np.nan), "'latency_frames' must be 0, 1"),
     "latency": (dict(latency_frames=-1), "'latency_frames' must be 0, 1"),
 }
 
@@ -296,6 +315,16 @@ def test_wrong_arguments_end_in_one_line(options, message):
     with pytest.raises(UsageError, match=message) as raised:
         in_mujoco(CAMERA + BALL, **options)
     assert "\n" not in str(raised.value)
+
+
+def test_data_of_a_model_with_other_geoms_is_refused():
+    scene = WALL + CAMERA + '<geom size=".1" pos="1 0 0"/>'
+    sensor, data = in_mujoco(scene)
+    sensor.read(data)
+    sensor.read(in_mujoco(scene)[1])  # of the same geoms
+    sensor.model.geom_size[0, 0] *= 2
+    with pytest.raises(UsageError, match="with other geoms make another sensor"):
+        sensor.read(data)
 
 
 def test_what_cannot_be_rendered_is_named():

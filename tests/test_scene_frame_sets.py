@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import xarray
 from own_generators import WALL, at
 
 from phasemark import InputFileError, UsageError
-from phasemark.cli import main
+from phasemark.cli import _terminate, main
 from phasemark.data import build_frames, open_frames
 from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
@@ -218,6 +219,16 @@ def test_a_mesh_that_a_generator_changes_is_analysed_again(tmp_path: Path) -> No
         np.testing.assert_allclose(depth, [2.0, 1.9, 1.8], rtol=2e-4)
 
 
+def test_a_mesh_returns_light_as_each_scene_says(tmp_path: Path) -> None:
+    """On the axis a wall of albedo 0.5 is brighter by 1 + g / 0.5 with a share g of retroreflected light."""
+    plan = plan_of("brighter", 3, variants=["mixed", "shot"])
+    with build_frames(plan, tmp_path / "one.h5", workers=1) as found:
+        amplitude = found[::2]["amplitude_e"][:, 6:10, 6:10].mean(axis=(1, 2))
+    np.testing.assert_allclose(amplitude / amplitude[0], [1, 3, 5], rtol=2e-2)
+    build_frames(plan, tmp_path / "two.h5", workers=2, shard_items=1).close()
+    assert (tmp_path / "two.h5").read_bytes() == (tmp_path / "one.h5").read_bytes()
+
+
 def test_scenes_come_from_files_with_cameras_and_labels(tmp_path: Path) -> None:
     for k, x in enumerate((1.05, 1.55)):
         trimesh.Scene({"wall": trimesh.creation.box((0.1, 6, 6), transform=at(x))}).export(tmp_path / f"{k}.glb")
@@ -294,6 +305,9 @@ def test_a_plan_that_cannot_be_is_refused_by_its_key(scenes: dict[str, Any], mes
         ("a_lamp", {"bodies": 1}, "scene 0: has 2 bodies, more than 'bodies' = 1"),
         ("two_steps", {}, "scene 0: 'camera2world' has 2 poses for 'steps' = 1"),
         ("inside_the_wall", {}, "scene 0 of the plan cannot be rendered: in frame 0 the lens is inside body 'wall'"),
+        ("no_labels", {}, "scene 0: 'labels' must be a mapping from names, got NoneType"),
+        ("half_a_letter", {}, "scene 0: the label 'what' must be text that UTF-8 can hold"),
+        ("too_large", {}, "scene 0: the label 'count' must be finite, or NaN where it is not there, got inf"),
         ("draws_elsewhere", {}, "scene 0: .* made another scene when it was called again"),
         ("room", {"options": {"colour": 1}}, "scene 0 .* raised TypeError: .* unexpected keyword argument 'colour'"),
     ],
@@ -353,6 +367,26 @@ def test_exports_hold_labels_and_refuse_what_needs_landmarks(frames: FrameSet, t
     assert first["truth"]["label_front_m"] is None
     with pytest.raises(UsageError, match="for a set of scenes, got 'bop'"):
         export_frames(frames, tmp_path / "bop", "bop")
+
+
+def test_a_label_of_several_words_and_lines_is_one_word_of_a_comment(tmp_path: Path) -> None:
+    with build_frames(plan_of("text_of_two_lines"), tmp_path / "set.h5", workers=1) as found:
+        path = export_frames(found, tmp_path / "frames.csv", "csv")
+    told = [line for line in path.read_text().splitlines() if line.startswith("# frame=")]
+    label = dict(word.split("=", 1) for word in told[0].split()[1:])["label_what"]
+    assert json.loads(label) == "a b\n1,2,3 split=test"
+    assert len(path.read_text().splitlines()) == 2 + 2 * len(told)
+
+
+def test_sigterm_within_a_generator_ends_the_program(tmp_path: Path) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        with pytest.raises(SystemExit) as caught:
+            plan_of("is_terminated").generate(0)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert caught.value.code == 143
 
 
 def test_a_scene_of_one_name_twice_cannot_be_made() -> None:

@@ -7,7 +7,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 import trimesh
-from oracles.analytic_scenes import Array, Solid, pixels
+from oracles.analytic_scenes import Array, Solid, light_of_ellipsoid, pixels
 from scipy.spatial.transform import Rotation
 
 from phasemark import InputFileError, UsageError
@@ -261,6 +261,40 @@ def test_bodies_joined_into_one_keep_their_albedos_and_round_surfaces():
     np.testing.assert_allclose(image.coverage[0], shares.sum(axis=-1), atol=1e-3)
 
 
+@pytest.mark.parametrize("angle_deg", [5, 20, 28, 60])
+def test_faces_of_joined_boxes_that_meet_at_a_small_angle_are_flat(angle_deg):
+    half = math.radians(angle_deg) / 2
+    turns = (Rotation.from_euler("z", turn).as_matrix() for turn in (half, -half))
+    boxes = [
+        Body.box((0.1, 0.3, 0.2), albedo=0.5, pose=placed((1.3, side, 0), turn))
+        for side, turn in zip((0.1, -0.1), turns, strict=True)
+    ]
+    apart = SceneRenderer(Scene(boxes), WIDE).phasors(placed()).phasor
+    joined = SceneRenderer(Scene([Body.joined(boxes, "roof")]), WIDE).phasors(placed()).phasor
+    np.testing.assert_allclose(joined, apart, atol=1e-5 * np.abs(apart).max())
+
+
+def test_sheets_of_one_mesh_that_pass_through_one_another_are_cut_there():
+    corners = np.array([[0, -0.15, -0.12], [0, 0.15, -0.12], [0, 0.15, 0.12], [0, -0.15, 0.12]])
+    sheet = trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], process=False)
+    turned = sheet.copy()
+    turned.vertices = corners @ Rotation.from_rotvec([0.0, 0.9, 0.5]).as_matrix().T
+    both = trimesh.util.concatenate([sheet, turned])
+    bodies = [Body(mesh, 0.5, pose=placed((1, 0.02, 0))) for mesh in (sheet, turned)]
+    apart = SceneRenderer(Scene(bodies), WIDE).phasors(placed()).phasor
+    one = SceneRenderer(Scene([Body(both, 0.5, pose=placed((1, 0.02, 0)))]), WIDE).phasors(placed()).phasor
+    np.testing.assert_allclose(one, apart, atol=1e-6 * np.abs(apart).max())
+
+
+def test_a_ball_dented_through_itself_is_what_dense_rays_see():
+    ball = trimesh.creation.icosphere(subdivisions=1, radius=0.15)
+    ball.vertices = np.where(ball.vertices[:, :1] < -0.05, ball.vertices * [-1.5, 1, 1], ball.vertices)
+    scene = Scene([Body(ball, 0.5, smooth=False, pose=placed((1, 0, 0)))])
+    exact = SceneRenderer(scene, WIDE).phasors(placed()).phasor
+    dense = SceneRenderer(scene, WIDE, rays=100).phasors(placed()).phasor
+    np.testing.assert_allclose(exact, dense, atol=2e-3 * np.abs(dense).max())  # 10 000 rays a pixel
+
+
 def test_moving_bodies_are_rendered_as_where_they_stand():
     rng = np.random.default_rng(5)
     bodies = [body_of(solid) for solid in random_solids(rng, 6)]
@@ -299,6 +333,27 @@ def test_a_sphere_fills_the_share_of_its_cone(distance_m):
     tangent = math.tan(math.asin(0.1 / distance_m)) / math.tan(math.radians(22.5))
     assert image.shares is not None
     assert image.shares[0, 0, 0, 0] == pytest.approx(math.pi / 4 * tangent**2, abs=3e-5)
+
+
+@pytest.mark.parametrize(
+    ("half_m", "tolerance"),
+    [
+        ((0.0015, 0.0015, 0.0015), 2e-4),  # a twentieth of a pixel
+        ((0.006, 0.004, 0.005), 3e-4),
+        ((0.042, 0.014, 0.056), 2e-3),  # three quarters of it
+        ((0.01, 0.04, 0.04), 2e-3),
+        ((0.002, 0.016, 0.016), 2e-3),
+    ],
+)
+def test_small_and_flat_ellipsoids_return_the_light_of_their_surface(half_m, tolerance):
+    one = WIDE.with_(rows=1, cols=1, half_angle_h_deg=2.86, half_angle_v_deg=2.86)
+    for number in range(3):
+        rotation = Rotation.random(random_state=number).as_matrix()
+        pose = placed((1.5, 0.004 * number, -0.007), rotation)
+        image = SceneRenderer(Scene([Body.ellipsoid(half_m, albedo=1.0, pose=pose)]), one).phasors(np.eye(4))
+        true = light_of_ellipsoid(half_m, pose, one.modulation_hz, 1000)
+        found = complex(image.phasor[0, 0, 0]) * (2 * math.tan(math.radians(2.86))) ** 2
+        assert abs(found - true) < tolerance * abs(true)
 
 
 @pytest.mark.parametrize("shape", ["box", "sphere", "capsule"])

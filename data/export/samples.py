@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -82,10 +84,15 @@ def write_lines(
         for start, sample in blocks(frames):
             truth = truth_columns(frames, sample)
             for k, line in enumerate(values_of(sample)):
-                told = " ".join(f"{name}={values[k]}" for name, values in truth.items())
+                told = " ".join(f"{name}={_one_word(str(values[k]))}" for name, values in truth.items())
                 file.write(f"# frame={start + k} {told}\n")
                 # nine digits bring a float32 back as it was
                 writer.writerow(["" if np.isnan(value) else f"{value:.9g}" for value in line])
+
+
+def _one_word(text: str) -> str:
+    """Return a value of a comment, in quotes as JSON has them if it holds what would end the word or the line."""
+    return text if re.fullmatch(r"[^\s\"=\x00-\x1f]*", text) else json.dumps(text).replace(" ", "\\u0020")
 
 
 def pinhole(frames: FrameSet) -> tuple[float, float, float, float]:

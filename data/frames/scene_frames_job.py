@@ -176,7 +176,7 @@ class _Renderers:
 
     def of(self, scene: Scene) -> SceneRenderer:
         """Return a renderer of a scene's bodies, as it was made: what it renders depends on no other scene."""
-        key = tuple((body.name, *_state(body.mesh), _albedo(body), body.smooth) for body in scene)
+        key = tuple((body.name, *_state(body.mesh), *_surface(body)) for body in scene)
         with self._lock:
             known = self._known.get(key)
         if known is None:
@@ -191,12 +191,12 @@ class _Renderers:
         return own
 
 
-def _albedo(body: Body) -> float:
-    """Return the albedo of a body, or which array holds those of its faces."""
-    return body.albedo if isinstance(body.albedo, float) else id(body.albedo)
+def _surface(body: Body) -> tuple[Any, ...]:
+    """Return how a body returns light: albedo, of each face where faces have their own, and gloss."""
+    albedo = body.albedo if isinstance(body.albedo, float) else body.albedo.tobytes()
+    return albedo, body.smooth, body.retroreflecting, body.specular, body.shininess
 
 
-def _state(mesh: SurfaceMesh) -> tuple[int, int]:
+def _state(mesh: SurfaceMesh) -> tuple[int, ...]:
     """Return which mesh it is, and in which state: trimesh notes changes of its arrays."""
-    vertices = mesh.vertices
-    return id(mesh), hash(vertices) if isinstance(vertices, TrackedArray) else 0
+    return id(mesh), *(hash(array) if isinstance(array, TrackedArray) else 0 for array in (mesh.vertices, mesh.faces))

@@ -78,9 +78,11 @@ class PlacedScene:
         """Return True if bodies, poses and labels are equal."""
 
         def bodies(placed: PlacedScene) -> list[tuple[Any, ...]]:
-            arrays = [(np.asarray(one.albedo).tobytes(), one.mesh.vertices.tobytes()) for one in placed.scene or ()]
-            numbers = [(one.name, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()]
-            return [*numbers, *arrays]
+            arrays = [(one.albedo, one.mesh.vertices, one.mesh.faces) for one in placed.scene or ()]
+            numbers = [
+                (one.name, one.smooth, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()
+            ]
+            return [*numbers, *(tuple(np.asarray(array).tobytes() for array in own) for own in arrays)]
 
         return (
             bodies(self) == bodies(other)
@@ -175,7 +177,9 @@ def placed(found: GeneratedScene, index: int, steps: int, labels: Mapping[str, s
             raise UsageError(f"'camera2world' has {len(cameras)} poses for 'steps' = {steps}")
         cameras = np.repeat(cameras, steps, axis=0) if len(cameras) < steps else cameras
         bodies = np.zeros((steps, 0, 4, 4)) if found.scene is None else found.scene.posed(found.bodies2world, steps)
-        own = {name: _label(name, values, steps) for name, values in dict(found.labels).items()}
+        if not isinstance(found.labels, Mapping):
+            raise UsageError(f"'labels' must be a mapping from names, got {type(found.labels).__name__}")
+        own = {name: _label(name, values, steps) for name, values in found.labels.items()}
         if labels is not None:
             _check_labels(own, labels)
     except PhasemarkError as error:
@@ -197,13 +201,18 @@ def _label(name: str, values: Any, steps: int) -> NDArray[Any]:
         raise UsageError(f"the label '{name}' has {len(given)} values for 'steps' = {steps}")
     given *= steps if len(given) == 1 else 1
     if all(isinstance(value, str) for value in given):
-        encoded = [value.encode() for value in given]
+        encoded = [value.encode(errors="replace") for value in given]
+        if any(own.decode() != value for own, value in zip(encoded, given, strict=True)):
+            raise UsageError(f"the label '{name}' must be text that UTF-8 can hold, got {given[0]!r}")
         if any(len(value) > LABEL_BYTES or b"\0" in value for value in encoded):
             raise UsageError(f"the label '{name}' must have at most {LABEL_BYTES} bytes, got {max(given, key=len)!r}")
         return np.array(encoded, f"S{LABEL_BYTES}")
     if not all(isinstance(value, numbers.Real) for value in given):
         raise UsageError(f"the label '{name}' must be a number or text, got {given[0]!r}")
-    array = np.array([float(value) for value in given])
+    try:
+        array = np.array([float(value) for value in given])
+    except OverflowError:  # an integer beyond all floats
+        array = np.array([np.inf])
     if np.isinf(array).any():
         raise UsageError(f"the label '{name}' must be finite, or NaN where it is not there, got {array.max()}")
     return array

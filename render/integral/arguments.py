@@ -143,6 +143,8 @@ class Light(NamedTuple):
 
 HIDDEN_LIMB = 2
 """Kind of a limb that another body hides: no edge of the image, yet a surface that is seen beside it ends there."""
+SLENDER = 1 << 20
+"""Ellipsoids with unequal axes are numbered from here on: across them cos θ turns more quickly than across a ball."""
 
 
 class Edges(NamedTuple):
@@ -156,7 +158,8 @@ class Edges(NamedTuple):
         1 for a silhouette of a smooth surface; then the surface lies on the side where
         du·(v − v_a) − dv·(u − u_a) < 0. :data:`HIDDEN_LIMB` where another body hides it.
     body : (e,) int32
-        Part of the surface that a silhouette belongs to, −1 where that is not known.
+        Part of the surface that a silhouette belongs to, −1 where that is not known; of an ellipsoid with unequal axes
+        plus :data:`SLENDER`.
     head : (rows + 2, cols + 2) int32
         First entry of each pixel's list, −1: none; with a border of one pixel around the image.
     link, owner : (m,) int32

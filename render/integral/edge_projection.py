@@ -15,10 +15,10 @@ import math
 
 import numpy as np
 
-from phasemark.render.integral.arguments import HIDDEN_LIMB
+from phasemark.render.integral.arguments import HIDDEN_LIMB, SLENDER
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
 from phasemark.render.integral.convex_parts import is_hidden, list_parts
-from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, segments_of
+from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, is_slender, segments_of
 from phasemark.render.kernel import kernel
 
 
@@ -86,9 +86,13 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
                     continue
                 a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
+                begin_of_fold = n
                 n = _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n)
                 if n < 0:
                     return FULL
+                if smooth_planes[5, first + i] >= 0.0:
+                    for k in range(begin_of_fold, n):
+                        edges.body[k] = 2 * SLENDER + np.int64(smooth_planes[5, first + i])
     for c in range(len(mesh.curves)):
         stop = _add_curve(mesh, mesh.curves[c], lens, matrix, offset, camera, edges, n)
         if stop < 0:
@@ -125,7 +129,11 @@ def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ig
             if n < 0:
                 return FULL
         return n
+    first = n
     n = _add_arc(mesh, begin, end, curve[13], curve[0] >= BALL, lens, near, matrix, offset, camera, edges, n)
+    if curve[0] == BALL and is_slender(curve):
+        for k in range(first, n):
+            edges.body[k] += SLENDER
     whole = 2.0 * math.pi
     if curve[0] == RIM and n >= 0 and end - begin < whole and before_rim(curve, lens):
         n = _add_arc(mesh, end, begin + whole, curve[13], False, lens, near, matrix, offset, camera, edges, n)

@@ -11,10 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from phasemark.render.integral.arguments import SLENDER
 from phasemark.render.integral.borders import place_borders
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.limbs import nearest_limb
-from phasemark.render.integral.quadrature_rules import FELT, place_points
+from phasemark.render.integral.quadrature_rules import FELT, MOST_POINTS, place_points
 from phasemark.render.kernel import kernel
 
 EMPTY = 1e-10
@@ -74,16 +75,17 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
     # A limb runs along an interval if it keeps its distance from both ends as well as this, in lengths of the box.
     parallel = 0.1
     for i in range(strip.k + 1):
-        a, b, left, right = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
+        a, b, left, right, body = _interval(0.5 * (start + stop), i, strip, box, scratch, box.curved, box.curved)
         near_left, near_right = a - left < FELT, right - b < FELT
         limb, width = near_left or near_right, b - a
+        whole = near_left and near_right and body >= 0.0
         a_low, b_low = _bounds(start, np.int64(0), i, strip, box, scratch)
         a_high, b_high = _bounds(stop, strip.n_slabs - 1, i, strip, box, scratch)
         extent = max(stop - start, abs(a_high - a_low), abs(b_high - b_low))
         steep = False
         if limb:
-            _, _, left_low, right_low = _interval(start, i, strip, box, scratch, near_left, near_right)
-            _, _, left_high, right_high = _interval(stop, i, strip, box, scratch, near_left, near_right)
+            _, _, left_low, right_low, _ = _interval(start, i, strip, box, scratch, near_left, near_right)
+            _, _, left_high, right_high, _ = _interval(stop, i, strip, box, scratch, near_left, near_right)
             for near, at_low, at_high in ((near_left, left_low, left_high), (near_right, right_low, right_high)):
                 moved = max(abs(at_high - at_low - a_high + a_low), abs(at_high - at_low - b_high + b_low))
                 steep = steep or (near and not moved < parallel * (box.s1 - box.s0))
@@ -94,15 +96,16 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
         for piece in range(pieces):
             lo = start + (stop - start) * _cut(piece / pieces, low, width, high)
             hi = start + (stop - start) * _cut((piece + 1) / pieces, low, width, high)
-            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch)
+            nodes, area, s_a, s_b, share = _gauss_rule(lo, hi, i, strip, box, scratch, whole)
             first, a_first, b_first = n, 0.0, 0.0
             for g in range(nodes):
                 s = s_a if g == 0 else s_b
                 weight = area * (share if g == 0 else 1.0 - share)
-                a, b, left, right = _interval(s, i, strip, box, scratch, near_left, near_right)
-                if n + 5 > len(weights):
+                a, b, left, right, body = _interval(s, i, strip, box, scratch, near_left, near_right)
+                if n + MOST_POINTS > len(weights):
                     return -1, region
-                placed = place_points(a, b, left, right, box.x1 - box.x0, box.bent, points[n:], weights[n:])
+                side, slender = box.x1 - box.x0, body >= SLENDER
+                placed = place_points(a, b, left, right, side, box.bent, slender, points[n:], weights[n:])
                 for j in range(n, n + placed):
                     weights[j] *= weight * box.scale
                     regions[j] = region
@@ -154,8 +157,10 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
+def _gauss_rule(lo, hi, i, strip, box, scratch, whole):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
+
+    A `whole` interval, from limb to limb of a round body, may be all that is seen of it: its light is no trifle.
 
     Returns
     -------
@@ -194,8 +199,8 @@ def _gauss_rule(lo, hi, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     variance = m2 / m0 - mean * mean
     extent = max(hi - lo, abs(last_a - first_a), abs(last_b - first_b))
     length, side = box.s1 - box.s0, box.x1 - box.x0
-    trifle = _TRIFLE * length * length * side * side
-    narrow = 0.04  # strips narrower than this share of their box get one line
+    trifle = 0.0 if whole else _TRIFLE * length * length * side * side
+    narrow = 0.0016 if whole else 0.04  # strips narrower than this share of their box get one line
     if extent < narrow * length or m0 * extent * extent < trifle or variance < 1e-12:
         return 1, m0, origin + mean, 0.0, 1.0
     skew = (m3 / m0 - mean * (3.0 * m2 / m0 - 2.0 * mean * mean)) / variance
@@ -218,7 +223,7 @@ def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
 def _interval(  # type: ignore[no-untyped-def]
     s, i, strip, box, scratch, seek_left, seek_right
 ):
-    """Return the ends of interval i on the line at s, and where its surface's limbs are, ∓inf where there is none.
+    """Return the ends of interval i on the line at s, where its limbs are, ∓inf where there is none, and their body.
 
     Limbs beyond the strip are looked for where `seek_left` and `seek_right` say so.
     """
@@ -254,4 +259,4 @@ def _interval(  # type: ignore[no-untyped-def]
         right, body = nearest_limb(scratch, s, -1.0, b, body)
     if seek_left and left == -np.inf and body >= 0.0:
         left, _ = nearest_limb(scratch, s, 1.0, a, body)
-    return a, b, left, right
+    return a, b, left, right, body

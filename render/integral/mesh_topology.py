@@ -77,9 +77,10 @@ class MeshTopology(NamedTuple):
         the smooth faces. Those of a first face follow one another, in the order of the smooth faces.
     first_fold : (g + 1,) int32
         Where the folds begin whose first face is a smooth face.
-    smooth_planes : (5, g) float64
-        Columns: planes of the smooth faces, those with folds, and their reach: how far the normal turns, |n − n'|, over
-        the face's folds at most. Each :data:`CLUSTER` are a cluster.
+    smooth_planes : (6, g) float64
+        Columns: planes of the smooth faces, those with folds, their reach: how far the normal turns, |n − n'|, over
+        the face's folds at most, and the number of the round solid that the face was made of, −1 where there is none.
+        Each :data:`CLUSTER` are a cluster.
     clusters : (c, 13) float64
         Per cluster a point, a mean normal, its offset from the point's plane, how far the faces' normals and offsets
         differ from those at most, the largest reach, how far the faces' corners are from the point at most, and where
@@ -153,6 +154,7 @@ class MeshTopology(NamedTuple):
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
         quadric = np.asarray(mesh.face_attributes.get("quadric", np.full(len(faces), -1)), dtype=np.int32)
+        united = np.asarray(mesh.face_attributes.get("shell", np.zeros(len(faces))), dtype=np.int64)
         a, b, c = (vertices[faces[:, k]] for k in range(3)) if len(faces) else (np.zeros((0, 3)),) * 3
         normals = np.cross(b - a, c - a)
         length = np.linalg.norm(normals, axis=1)
@@ -163,6 +165,7 @@ class MeshTopology(NamedTuple):
         kept = np.flatnonzero(kept)
         kept = kept[along_curve(vertices[faces[kept]].mean(axis=1))]
         faces, part, albedo, quadric, a = faces[kept], part[kept], albedo[kept], quadric[kept], a[kept]
+        united = united[kept]
         normals = normals[kept] / length[kept, None]
         planes = np.column_stack([normals, np.einsum("ij,ij->i", normals, a)])
         edges, regular = _edges(faces)
@@ -170,10 +173,11 @@ class MeshTopology(NamedTuple):
         turn = np.where(other >= 0, _angle_between(normals[first], normals[other]), np.inf)
         crease = ~regular | (turn > crease_rad + 1e-9)
         crease |= (albedo[first] != albedo[other]) | (quadric[first] != quadric[other])
+        crease |= united[first] != united[other]  # where shells run through one another nothing is smooth
         coplanar_rad = 1e-7
         fold = ~crease & (turn > coplanar_rad)
         patch = component_labels(len(faces), edges[~crease][:, 2:])
-        corners = _corner_normals(vertices, faces, normals, patch, crease_rad)
+        corners = _corner_normals(vertices, faces, normals, patch, united, crease_rad)
         flat = (np.einsum("fij,fj->fi", corners, normals) > 1 - 1e-12).all(axis=1)
         # the corner of the other face off the edge lies before the first face's plane
         off_edge = vertices[faces[other]].sum(axis=1) - vertices[edges[:, 0]] - vertices[edges[:, 1]]
@@ -190,6 +194,8 @@ class MeshTopology(NamedTuple):
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
         )
+        _, solid = np.unique(np.column_stack([united, shell]), axis=0, return_inverse=True)
+        round_solid = np.where(quadric >= 0, solid.reshape(-1), -1)
         closed = bool(regular.all() and (six_volumes > 0).all())
         return cls(
             vertices=np.ascontiguousarray(vertices),
@@ -214,7 +220,7 @@ class MeshTopology(NamedTuple):
             concave=np.ascontiguousarray(rise[crease] > 0),
             folds=folds,
             first_fold=first_fold,
-            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach])[smooth_faces].T),
+            smooth_planes=np.ascontiguousarray(np.column_stack([planes, fold_reach, round_solid])[smooth_faces].T),
             clusters=clusters,
             curves=np.zeros((0, 14)),
             parts=np.zeros((0, 2), np.int64),
@@ -249,7 +255,7 @@ class MeshTopology(NamedTuple):
             concave=np.zeros(0, np.bool_),
             folds=np.zeros((0, 3), np.int32),
             first_fold=np.zeros(1, np.int32),
-            smooth_planes=np.zeros((5, 0)),
+            smooth_planes=np.zeros((6, 0)),
             clusters=np.zeros((0, 13)),
             curves=np.zeros((0, 14)),
             parts=np.zeros((0, 2), np.int64),
@@ -394,6 +400,7 @@ def _corner_normals(
     faces: NDArray[np.int64],
     normals: NDArray[np.float64],
     patch: NDArray[np.int32],
+    shell: NDArray[np.int64],
     crease_rad: float,
 ) -> NDArray[np.float64]:
     """Average, at each corner, the normals of the vertex's faces that lie within `crease_rad` of the corner's own face.
@@ -406,11 +413,14 @@ def _corner_normals(
     """
     corner_of = np.argsort(faces.ravel(), kind="stable")
     start = np.searchsorted(faces.ravel()[corner_of], np.arange(len(vertices) + 1))
-    return np.asarray(_average_corners(vertices, faces, normals, patch, corner_of, start, math.cos(crease_rad + 1e-9)))
+    limit = math.cos(crease_rad + 1e-9)
+    return np.asarray(_average_corners(vertices, faces, normals, patch, shell, corner_of, start, limit))
 
 
 @njit(cache=True)
-def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limit):  # type: ignore[no-untyped-def]
+def _average_corners(  # type: ignore[no-untyped-def]
+    vertices, faces, normals, patch, shell, corner_of, start, cos_limit
+):
     # numbers one by one: arrays of three would be allocated, and multiplied by a library, a million times a mesh
     n_faces = len(faces)
     weight = np.empty((n_faces, 3))
@@ -431,6 +441,8 @@ def _average_corners(vertices, faces, normals, patch, corner_of, start, cos_limi
             apex = False
             for j in range(start[vertex], start[vertex + 1]):
                 g, corner = corner_of[j] // 3, corner_of[j] % 3
+                if shell[g] != shell[f]:
+                    continue
                 gx, gy, gz = normals[g, 0], normals[g, 1], normals[g, 2]
                 if nx * gx + ny * gy + nz * gz >= cos_limit:
                     share = weight[g, corner]

@@ -32,10 +32,12 @@ G2X, G2W = gauss_legendre(2)
 G3X, G3W = gauss_legendre(3)
 G4X, G4W = gauss_legendre(4)
 G5X, G5W = gauss_legendre(5)
+MOST_POINTS = 16
+GMX, GMW = gauss_legendre(MOST_POINTS)
 
 
 @kernel
-def place_points(a, b, left, right, side, bent, points, weights):  # type: ignore[no-untyped-def]
+def place_points(a, b, left, right, side, bent, slender, points, weights):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (∓inf: none).
 
     `side` is the width of the box in which the interval lies.
@@ -58,6 +60,8 @@ def place_points(a, b, left, right, side, bent, points, weights):  # type: ignor
     else:
         count = 1 if b - a < _THIN * side else (3 if bent and b - a > wide * side else 2)
         t0, t1 = a, b
+    if slender and (near_left or near_right):
+        count = MOST_POINTS
     total = 0.0
     for g in range(count):
         if count == 1:
@@ -68,8 +72,10 @@ def place_points(a, b, left, right, side, bent, points, weights):  # type: ignor
             t, w = t0 + G3X[g] * (t1 - t0), G3W[g]
         elif count == 4:
             t, w = t0 + G4X[g] * (t1 - t0), G4W[g]
-        else:
+        elif count == 5:
             t, w = t0 + G5X[g] * (t1 - t0), G5W[g]
+        else:
+            t, w = t0 + GMX[g] * (t1 - t0), GMW[g]
         if near_left and near_right:
             x, w = middle + half * math.sin(t), w * math.cos(t)
         elif near_left:

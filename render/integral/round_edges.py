@@ -51,6 +51,16 @@ def arc_of(curve, lens, arc):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def is_slender(curve):  # type: ignore[no-untyped-def]
+    """Return whether the axes of a ball differ by more than a tenth."""
+    least, most = math.inf, 0.0
+    for k in range(4, 13, 3):
+        square = curve[k] ** 2 + curve[k + 1] ** 2 + curve[k + 2] ** 2
+        least, most = min(least, square), max(most, square)
+    return most > 1.2 * least
+
+
+@kernel
 def before_rim(curve, lens):  # type: ignore[no-untyped-def]
     """Return whether the lens is before the plane that a rim is the edge of."""
     height = 0.0

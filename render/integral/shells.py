@@ -28,7 +28,8 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     Returns
     -------
     SurfaceMesh
-        A union keeps albedo and quadric of each face. Part labels are lost; they follow from the height again.
+        A union keeps albedo and quadric of each face, and numbers the shell that it was of. Part labels are lost; they
+        follow from the height again.
     """
     shells = _shells(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
     if len(shells) < 2:
@@ -57,7 +58,10 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     return trimesh.Trimesh(
         np.asarray(united.vert_properties)[:, :3],
         np.asarray(united.tri_verts, dtype=np.int64),
-        face_attributes={name: own[np.asarray(united.face_id, np.int64)] for name, own in attributes.items()},
+        face_attributes={
+            **{name: own[np.asarray(united.face_id, np.int64)] for name, own in attributes.items()},
+            "shell": np.repeat(np.asarray(united.run_original_id), np.diff(united.run_index) // 3).astype(np.int64),
+        },
         metadata=dict(mesh.metadata),
         process=False,
     )

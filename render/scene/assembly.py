@@ -24,9 +24,11 @@ from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, al
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body, Surface
-from phasemark.render.scene.crossings import crossings, move_onto
+from phasemark.render.scene.crossings import crossings, cut_where_it_crosses_itself, move_onto, with_creases
 from phasemark.render.scene.solids import Solid
 
+_RIGID = 4e-6
+"""Two bodies that moved by no more than this against one another (metres, radians) moved as one."""
 _NO_GRID = FaceGrid.of_faces(np.zeros((0, 3, 3)), np.zeros(0, np.bool_))
 _WATCHED = np.array([[1.0, 0.31, 0.17], [-0.23, 1.0, 0.41], [0.37, -0.19, 1.0]])
 """Directions, and their opposites, in which it is asked whether a lens is inside a body."""
@@ -67,7 +69,7 @@ class Assembly:
         self._first = _Firsts.of(self._own, self._solids)
         self._parts = _Parts.of(self._solids, self._first)
         self._frames = _Placed.joined(self._own, self._parts.balls)
-        self._curves: dict[tuple[int, int], tuple[NDArray[np.float64], NDArray[np.int64]]] = {}
+        self._curves: dict[tuple[int, int], _Curve] = {}
         self._bounds = np.empty((len(bodies), 2, 3))
         self._base = self._joined()
         self._turn(np.arange(len(bodies)))
@@ -191,7 +193,7 @@ class Assembly:
             concave=np.concatenate([mesh.concave for mesh in own]),
             folds=np.ascontiguousarray(np.concatenate(folds), np.int32),
             first_fold=np.append(np.concatenate(begins), first.fold[-1]).astype(np.int32),
-            smooth_planes=np.empty((5, n_smooth)),
+            smooth_planes=np.empty((6, n_smooth)),
             clusters=np.concatenate([_from_smooth(mesh.clusters, first.smooth[b]) for b, mesh in enumerate(own)]),
             curves=np.empty((first.curve[-1], 14)),
             parts=self._parts.faces,
@@ -217,17 +219,27 @@ class Assembly:
 
     def _cross(self, moved: NDArray[np.int64]) -> None:
         """Find the curves along which bodies that moved pass through any other."""
-        gone = set(moved.tolist())
-        self._curves = {pair: found for pair, found in self._curves.items() if gone.isdisjoint(pair)}
+        gone, before = set(moved.tolist()), self._curves
+        self._curves = {pair: found for pair, found in before.items() if gone.isdisjoint(pair)}
         has_moved = np.zeros(len(self._own), np.bool_)
         has_moved[moved] = True
         for one, two in _close_pairs(self._base, has_moved, self._bounds, self._first.part):
-            (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
-            ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
-            if len(ends):
-                pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]]) + self._first.face[[one, two]]
-                move_onto(self._base, pairs, ends)
-                self._curves[int(one), int(two)] = ends, pairs
+            pair, pose = (int(one), int(two)), self._poses[one]
+            other = np.column_stack([self._poses[two, :3, :3], self._poses[two, :3, 3] - pose[:3, 3]])
+            relative = product(pose[:3, :3].T, other)
+            found = before.get(pair)
+            if found is None or np.abs(found.relative - relative).max() > _RIGID:
+                ends, pairs = self._found_curve(*pair)
+                found = _Curve(relative, product(ends - pose[:3, 3], pose[:3, :3]), pairs)
+            self._curves[pair] = found
+
+    def _found_curve(self, one: int, two: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Return the segments (k, 2, 3) along which two bodies pass through one another, and their faces (k, 2)."""
+        (vertices, faces, own), (corners, others, theirs) = self._placed_shell(one), self._placed_shell(two)
+        ends, pairs = crossings(np.concatenate([vertices, corners]), faces, others + np.int32(len(vertices)))
+        pairs = np.column_stack([own[pairs[:, 0]], theirs[pairs[:, 1]]]) + self._first.face[[one, two]]
+        move_onto(self._base, pairs, ends)
+        return ends, pairs
 
     def _placed_shell(self, b: int) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int64]]:
         """Return the triangles of a body where it stands, and the face of the body that each of them stands for."""
@@ -238,20 +250,15 @@ class Assembly:
     def _with_curves(self) -> MeshTopology:
         """Return the surface with the curves among its creases."""
         base = self._base._replace(low=self._bounds[:, 0].min(axis=0), high=self._bounds[:, 1].max(axis=0))
-        if not self._curves:
+        placed = [(self._poses[pair[0]], self._curves[pair]) for pair in sorted(self._curves)]
+        if not any(len(curve.pairs) for _, curve in placed):
             return base
-        found = [self._curves[pair] for pair in sorted(self._curves)]
-        ends, pairs = (np.concatenate(column) for column in zip(*found, strict=True))
+        ends = np.concatenate([product(curve.ends, pose[:3, :3].T) + pose[:3, 3] for pose, curve in placed])
+        pairs = np.concatenate([curve.pairs for _, curve in placed])
         # what a closed body hides is asked of the first face: an open one hides nothing
         open_last = base.closed[pairs[:, 0]] & ~base.closed[pairs[:, 1]]
         pairs[open_last] = pairs[open_last][:, ::-1]
-        n = len(base.vertices)
-        number = n + np.arange(2 * len(ends)).reshape(-1, 2)
-        return base._replace(
-            vertices=np.concatenate([base.vertices, ends.reshape(-1, 3)]),
-            creases=np.concatenate([base.creases, np.column_stack([number, pairs]).astype(np.int32)]),
-            concave=np.concatenate([base.concave, np.ones(len(ends), np.bool_)]),
-        )
+        return with_creases(base, ends, pairs, True)
 
     def _intersectors(self) -> Intersector:
         """Return the intersector: of all that stands still, and of each body that moves in its own frame."""
@@ -282,6 +289,24 @@ def _inside(frame: int, name: str) -> UsageError:
         f"in frame {frame} the lens is inside body '{name}': move one of them, leave the body out, or, if it is a room,"
         " take body.inside_out()"
     )
+
+
+class _Curve(NamedTuple):
+    """Where two bodies pass through one another.
+
+    Parameters
+    ----------
+    relative : (3, 4) float64
+        Pose of the second in the frame of the first.
+    ends : (k, 2, 3) float64
+        Segments, in the frame of the first.
+    pairs : (k, 2) int64
+        Faces of both.
+    """
+
+    relative: NDArray[np.float64]
+    ends: NDArray[np.float64]
+    pairs: NDArray[np.int64]
 
 
 class _Mover(NamedTuple):
@@ -389,12 +414,20 @@ class _Placed(NamedTuple):
             np.concatenate([mesh.planes for mesh in own]),
             np.concatenate([mesh.corner_normals for mesh in own]),
             np.concatenate([mesh.search for mesh in own]),
-            np.concatenate([mesh.smooth_planes for mesh in own], axis=1),
+            _with_solids_numbered([mesh.smooth_planes for mesh in own]),
             np.concatenate([mesh.clusters for mesh in own]),
             np.concatenate([mesh.quadrics for mesh in own]),
             np.concatenate([mesh.curves for mesh in own]),
             balls,
         )
+
+
+def _with_solids_numbered(planes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """Join smooth planes, (6, g), with other numbers for the round solids of other bodies."""
+    joined = np.concatenate(planes, axis=1)
+    counts = [int(own[5].max(initial=-1.0)) + 1 for own in planes]
+    joined[5] += np.where(joined[5] >= 0, np.repeat(np.cumsum([0, *counts[:-1]]), [own.shape[1] for own in planes]), 0)
+    return joined
 
 
 class _Parts(NamedTuple):
@@ -436,7 +469,7 @@ def _turn_bodies(moved, poses, first, own, placed, bounds):  # type: ignore[no-u
             _turn_plane(own.search[f, 8:12], transposed, offset, -1.0, placed.search[f, 8:12])
         for i in range(first.smooth[b], first.smooth[b + 1]):
             _turn_plane(own.smooth_planes[:4, i], transposed, offset, 1.0, placed.smooth_planes[:4, i])
-            placed.smooth_planes[4, i] = own.smooth_planes[4, i]
+            placed.smooth_planes[4:, i] = own.smooth_planes[4:, i]
         for c in range(first.cluster[b], first.cluster[b + 1]):
             _move(own.clusters[c, :3], transposed, offset, placed.clusters[c, :3])
             _turn(own.clusters[c, 3:6], transposed, placed.clusters[c, 3:6])
@@ -629,7 +662,8 @@ def _analysed_mesh(body: Body, known: dict[tuple[bytes, bool], MeshTopology]) ->
     mesh: Surface = Surface.of(body)
     key = mesh_digest(mesh), body.smooth
     if key not in known:
-        known[key] = MeshTopology.from_mesh(unite_shells(mesh), CREASE_RAD if body.smooth else 0.0)
+        whole = MeshTopology.from_mesh(unite_shells(mesh), CREASE_RAD if body.smooth else 0.0)
+        known[key] = cut_where_it_crosses_itself(whole)
     return known[key]
 
 

@@ -8,6 +8,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from phasemark.render.integral.mesh_topology import MeshTopology
+
 _BLOCK = 32
 """Faces that are looked at together."""
 _TOUCH = 1e-9
@@ -46,6 +48,30 @@ def crossings(
         if n <= room:
             return ends[:n], pairs[:n]
         room = n
+
+
+def cut_where_it_crosses_itself(mesh: MeshTopology) -> MeshTopology:
+    """Return a mesh whose creases include the curves along which its faces pass through one another.
+
+    They may be seen from any side, and hide nothing for certain: the mesh counts as open.
+    """
+    ends, pairs = crossings(mesh.vertices, mesh.faces, mesh.faces)
+    once = pairs[:, 0] < pairs[:, 1]
+    if not once.any():
+        return mesh
+    return with_creases(mesh._replace(closed=np.zeros(len(mesh.faces), np.bool_)), ends[once], pairs[once], False)
+
+
+def with_creases(
+    mesh: MeshTopology, ends: NDArray[np.float64], pairs: NDArray[np.int64], concave: bool
+) -> MeshTopology:
+    """Return a mesh with segments (k, 2, 3) between pairs of faces (k, 2) among its creases."""
+    number = len(mesh.vertices) + np.arange(2 * len(ends)).reshape(-1, 2)
+    return mesh._replace(
+        vertices=np.concatenate([mesh.vertices, ends.reshape(-1, 3)]),
+        creases=np.concatenate([mesh.creases, np.column_stack([number, pairs]).astype(np.int32)]),
+        concave=np.concatenate([mesh.concave, np.full(len(ends), concave)]),
+    )
 
 
 @njit(cache=True, nogil=True)

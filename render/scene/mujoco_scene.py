@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, UsageError
-from phasemark.render.integral.components import component_labels
 from phasemark.render.rigid import product
 from phasemark.render.scene import NEEDS_MUJOCO
 from phasemark.render.scene.body import Body
@@ -24,8 +22,6 @@ except ImportError:
     raise UsageError(NEEDS_MUJOCO) from None
 
 _GEOM = mujoco.mjtGeom
-_OPEN = (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_HFIELD)
-"""Types of geoms that are not united with others of their body: a plane has no inside, terrain is large."""
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _REACH_M = 1000.0
 """Half a side of the square that stands for an infinite plane."""
@@ -42,7 +38,7 @@ class SeenModel:
     Parameters
     ----------
     bodies : tuple of Body
-        Each geom is one; solids of one MuJoCo body and albedo that overlap are one together.
+        Each geom is one.
     owner : (b,) int64
         Numbers of the MuJoCo bodies.
     local : (b, 4, 4) float64
@@ -109,21 +105,14 @@ def seen_model(
             f"the model has no geom for the sensor to see: {model.ngeom} geoms, groups {tuple(groups)} are visible"
         )
     bodies: list[Body] = []
-    local: list[NDArray[np.float64]] = []
-    first: list[int] = []
-    for geoms in _together(model, seen, own, smooth):
-        body, pose = geoms[0][1], _local(model, geoms[0][0])
-        if len(geoms) > 1:
-            body, pose = Body.joined([replace(shape, pose=_local(model, g)) for g, shape in geoms]), np.eye(4)
-        g = geoms[0][0]
+    for g in seen.tolist():
         name = body_name(model, int(model.geom_bodyid[g]))
         if any(other.name == name for other in bodies):
             name = f"{name}, {geom_name(model, g)}"
-        bodies.append(replace(body, albedo=own[g], name=name))
-        local.append(pose)
-        first.append(g)
-    endless = (model.geom_type[first] == _GEOM.mjGEOM_PLANE)[:, None] & (model.geom_size[first, :2] <= 0)
-    found = SeenModel(tuple(bodies), model.geom_bodyid[first].astype(np.int64), np.array(local), endless)
+        bodies.append(replace(_shape(model, g, smooth), albedo=own[g], name=name))
+    endless = (model.geom_type[seen] == _GEOM.mjGEOM_PLANE)[:, None] & (model.geom_size[seen, :2] <= 0)
+    local = np.array([_local(model, g) for g in seen.tolist()])
+    found = SeenModel(tuple(bodies), model.geom_bodyid[seen].astype(np.int64), local, endless)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)  # what never moves stands where it is from the start
     poses = found.poses(data, np.zeros(3))
@@ -147,33 +136,6 @@ def bodies_of_mjcf(path: Path, albedo: float | None) -> tuple[Body, ...]:
         version = f"; a compiled model must be of its version, {mujoco.__version__}" if compiled else ""
         raise InputFileError(f"{path}: MuJoCo cannot read it: {' '.join(str(error).split())}{version}") from None
     return seen_model(model, "rgba" if albedo is None else albedo, -1, (0, 1, 2), True).bodies
-
-
-def _together(
-    model: Any, seen: NDArray[np.int64], albedo: Sequence[float], smooth: bool
-) -> list[list[tuple[int, Body]]]:
-    """Return the geoms with their shapes, those of one list to be united: solids of one body that overlap."""
-    shapes = {g: _shape(model, g, smooth) for g in seen.tolist()}
-    bounds = {g: _moved(shape, _local(model, g)).bounds for g, shape in shapes.items()}
-    solid = [g for g in shapes if model.geom_type[g] not in _OPEN and shapes[g].mesh.is_volume]  # type: ignore[attr-defined]
-    pairs = [
-        (a, b)
-        for a, b in itertools.combinations(solid, 2)
-        if (model.geom_bodyid[a], albedo[a], shapes[a].smooth) == (model.geom_bodyid[b], albedo[b], shapes[b].smooth)
-        and (bounds[a][0] < bounds[b][1]).all()
-        and (bounds[b][0] < bounds[a][1]).all()
-    ]
-    label = component_labels(model.ngeom, np.array(pairs, np.int64).reshape(-1, 2))
-    lists: dict[int, list[tuple[int, Body]]] = {}
-    for g, shape in shapes.items():
-        lists.setdefault(int(label[g]), []).append((g, shape))
-    return list(lists.values())
-
-
-def _moved(shape: Body, pose: NDArray[np.float64]) -> trimesh.Trimesh:
-    """Return the mesh of a shape in the frame of its body."""
-    vertices = trimesh.transform_points(np.asarray(shape.mesh.vertices), pose)
-    return trimesh.Trimesh(vertices, shape.mesh.faces, process=False)
 
 
 def body_name(model: Any, body: int) -> str:
@@ -214,7 +176,7 @@ def _albedos(model: Any, albedo: str | float | Mapping[str, float]) -> list[floa
                 known = ", ".join([name for name in names if name][:8]) or "none has a name"
                 raise UsageError(f"'albedo' names geom {name!r}, which the model does not have: {known}")
             own[names.index(name)] = _albedo(value, f"'albedo' of geom '{name}'")
-    elif albedo != "rgba":
+    elif not isinstance(albedo, str) or albedo != "rgba":
         own[:] = _albedo(albedo, "'albedo'")
     return [round(float(value), 6) for value in own]
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from phasemark import UsageError
 
 _ON_TIME = 1e-6
@@ -30,9 +32,9 @@ class Cadence:
     """
 
     def __init__(self, rate_hz: float, latency_frames: int) -> None:
-        if not (math.isfinite(rate_hz) and rate_hz > 0):
+        if not isinstance(rate_hz, int | float | np.number) or not (math.isfinite(rate_hz) and rate_hz > 0):
             raise UsageError(f"'rate_hz' must be positive, got {rate_hz!r}")
-        if latency_frames < 0 or latency_frames != int(latency_frames):
+        if not isinstance(latency_frames, int | np.integer) or latency_frames < 0:
             raise UsageError(f"'latency_frames' must be 0, 1, 2, …, got {latency_frames!r}")
         self.rate_hz, self.latency_frames = float(rate_hz), int(latency_frames)
         self.restart()

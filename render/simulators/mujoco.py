@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +48,8 @@ class TofTruth:
     Parameters
     ----------
     z_m : (rows, cols) float64
-        Distance along the sensor's axis at the centre ray of each zone, of MuJoCo's own geometry; NaN where it meets
+        Distance along the sensor's axis at the centre ray of each zone, as MuJoCo's own rays meet it: those pass
+        planes from behind and what either a geom's own colour or its material makes invisible; NaN where there is
         nothing.
     shares : (rows, cols, b) float64
         Share of each zone that each MuJoCo body fills.
@@ -164,9 +165,10 @@ class TofSensor:
             raise UsageError(f"'model' must be a mujoco.MjModel, got {type(model).__name__}")
         if (camera is None) == (site is None):
             raise UsageError("a sensor is on a camera or on a site: give camera=… or site=…, and not both")
-        if not set(groups) <= set(range(_GROUPS)):
-            raise UsageError(f"'groups' must be numbers from 0 to {_GROUPS - 1}, got {tuple(groups)}")
+        if not isinstance(groups, Iterable) or not set(groups) <= set(range(_GROUPS)):
+            raise UsageError(f"'groups' must be numbers from 0 to {_GROUPS - 1}, got {groups!r}")
         self.model = model
+        self._layout = _layout(model)
         self.sensor = sensor if isinstance(sensor, Sensor) else preset(sensor)
         self._site = None if site is None else _number(model, "site", site)
         self._camera = None if camera is None else _number(model, "camera", camera)
@@ -196,10 +198,10 @@ class TofSensor:
         Raises
         ------
         UsageError
-            The seed is negative.
+            The seed is negative or no whole number.
         """
-        if seed is not None and seed < 0:
-            raise UsageError(f"'seed' must not be negative, got {seed!r}")
+        if seed is not None and (not isinstance(seed, int | np.integer) or seed < 0):
+            raise UsageError(f"'seed' must be a whole number, at least 0, got {seed!r}")
         self._cadence.restart()
         if seed is not None:
             self._seed, self._run = seed, -1
@@ -219,11 +221,14 @@ class TofSensor:
         Raises
         ------
         UsageError
-            The data is of another model, a pose or the time is not finite, no pose has been computed yet, or the lens
-            is inside a body.
+            The data is of another model, or the model's geoms have changed since, a pose or the time is not finite, no
+            pose has been computed yet, or the lens is inside a body.
         """
-        if not isinstance(data, mujoco.MjData) or _layout(data.model) != _layout(self.model):
-            raise UsageError("'data' must be a mujoco.MjData of the sensor's model")
+        if not isinstance(data, mujoco.MjData) or _layout(data.model) != self._layout:
+            raise UsageError(
+                "'data' must be a mujoco.MjData of the sensor's model, as it was when the sensor was made: with other"
+                " geoms make another sensor"
+            )
         time_s = float(data.time)
         if not math.isfinite(time_s):
             raise UsageError(f"the time of the data is {time_s}")
@@ -298,9 +303,10 @@ class TofSensor:
         return np.asarray(np.where(geom >= 0, distance, np.nan).reshape(self._cosine.shape) * self._cosine)
 
 
-def _layout(model: mujoco.MjModel) -> tuple[int, int, bytes]:
-    """Return counts and names: equal for models whose data has the same places, as of one file compiled twice."""
-    return model.nbody, model.ngeom, model.names
+def _layout(model: mujoco.MjModel) -> tuple[bytes, ...]:
+    """Return names and geoms: equal for models whose data is that of the same scene, as of one file compiled twice."""
+    geoms = ("bodyid", "type", "dataid", "size", "pos", "quat")
+    return model.names, *(getattr(model, f"geom_{name}").tobytes() for name in geoms)
 
 
 def _targets(frames: HistogramFrames) -> _Reported:

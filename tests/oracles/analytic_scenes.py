@@ -69,6 +69,25 @@ def pixels(
     return phasor, shares
 
 
+def light_of_ellipsoid(half: tuple[float, ...], pose: Array, hz: float, n: int) -> complex:
+    """Return ∫ phasor du dv over the image plane x = 1 of an ellipsoid of albedo 1 before a lens at the origin.
+
+    It is summed over the surface, n × 2n patches: one of area dS that faces the lens by cos θ fills
+    cos θ dS / (r² c³) of the plane, with c the cosine off the axis.
+    """
+    polar, around = np.meshgrid((np.arange(n) + 0.5) * np.pi / n, (np.arange(2 * n) + 0.5) * np.pi / n)
+    unit = np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar)], -1)
+    normal = unit / half  # dS · (unit normal) is this times the product of the axes times the patch of the unit sphere
+    patch = np.prod(half) * np.sin(polar) * (np.pi / n) ** 2
+    points = (unit * half) @ pose[:3, :3].T + pose[:3, 3]
+    range_m = np.linalg.norm(points, axis=-1)
+    rays = points / range_m[..., None]
+    facing = np.maximum(-((normal @ pose[:3, :3].T) * rays).sum(-1), 0.0)  # cos θ times |normal|
+    cosine = facing / np.linalg.norm(normal, axis=-1)
+    light = cosine / range_m**2 * np.exp(4j * np.pi * hz / LIGHT_M_PER_S * range_m)
+    return complex((light * facing * patch / (range_m**2 * rays[..., 0] ** 3)).sum())
+
+
 def _box(half: tuple[float, ...], lens: Array, rays: Array) -> tuple[Array, Array]:
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-np.array(half) - lens) / rays, (np.array(half) - lens) / rays
