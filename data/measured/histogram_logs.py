@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import os
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, PhasemarkError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
-from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, opened_npz
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, npz_arrays
 from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
@@ -103,7 +102,7 @@ def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> Histogra
     """
     path = Path(path)
     content = read_whole(path, most_bytes=_MOST_BYTES)
-    arrays = _npz(content, path) if content[:4] == b"PK\x03\x04" else _json_lines(content, path)
+    arrays = npz_arrays(content, path, _of_log) if content[:4] == b"PK\x03\x04" else _json_lines(content, path)
     if "histogram" not in arrays:
         raise InputFileError(f"{path}: must have 'histogram', got {', '.join(arrays) or 'nothing'}")
     for name, array in arrays.items():
@@ -225,17 +224,10 @@ def _cell(text: str, path: Path, row: int, column: str) -> float:
         raise InputFileError(f"{path}: frame {row}, column '{column}': '{text[:20]}' is no number") from None
 
 
-def _npz(content: bytes, path: Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an NPZ file that a log has."""
-    try:
-        with opened_npz(io.BytesIO(content), len(content), path) as archive:
-            of_landmark = "class" in archive  # then distance_m is that of a landmark's axis, and no plane's
-            names = [name for name in _NAMES if name in archive and not (of_landmark and name == "distance_m")]
-            return {name: np.asarray(archive[name]) for name in names}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
-        if isinstance(error, PhasemarkError):
-            raise
-        raise InputFileError(f"{path}: not an NPZ file that can be read ({error})") from None
+def _of_log(names: Collection[str]) -> list[str]:
+    """Return those names of arrays that a log has."""
+    of_landmark = "class" in names  # then distance_m is that of a landmark's axis, and no plane's
+    return [name for name in _NAMES if name in names and not (of_landmark and name == "distance_m")]
 
 
 def _json_lines(content: bytes, path: Path) -> dict[str, NDArray[Any]]:

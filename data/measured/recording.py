@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+import zipfile
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +14,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError
+from phasemark import InputFileError, PhasemarkError
 from phasemark.data.files.guard import EXPANSION, FREE_BYTES
 
 MILLISECONDS, SECONDS = "t_ms", "t_s"
@@ -107,3 +108,22 @@ def opened_npz(file: BinaryIO, size: int, path: Path) -> Iterator[Any]:
         if declared > FREE_BYTES + EXPANSION * size:
             raise InputFileError(f"{path}: refused: declares {declared} bytes, far more than its size can hold")
         yield archive
+
+
+def npz_arrays(
+    content: bytes, path: Path, chosen: Callable[[Collection[str]], Iterable[str]] = list
+) -> dict[str, NDArray[Any]]:
+    """Return arrays of the content of an NPZ file by their names: all of them, or those that `chosen` takes.
+
+    Raises
+    ------
+    InputFileError
+        It cannot be read, or announces far more than it can hold.
+    """
+    try:
+        with opened_npz(io.BytesIO(content), len(content), path) as archive:
+            return {name: np.asarray(archive[name]) for name in chosen(archive)}
+    except PhasemarkError:
+        raise
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise InputFileError(f"{path}: not an NPZ file that can be read ({error})") from None

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import os
 import warnings
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, PhasemarkError, UsageError
-from phasemark.data.measured.recording import opened_npz
+from phasemark import InputFileError, UsageError
+from phasemark.data.measured.recording import npz_arrays
 from phasemark.inputs import read_text, read_whole
 from phasemark.inputs.table_cells import cells_of, finite_number
 from phasemark.matcher.locate.kernel_arguments import Scan
@@ -183,13 +181,7 @@ def _arrays(path: Path) -> dict[str, NDArray[Any]]:
     content = read_whole(path, most_bytes=_MOST_BYTES)
     if content[:2] != b"PK":
         raise InputFileError(f"{path}: must be an NPZ file of arrays")
-    try:
-        with opened_npz(io.BytesIO(content), len(content), path) as archive:
-            return {name: np.asarray(archive[name]) for name in archive}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError) as error:
-        if isinstance(error, PhasemarkError):
-            raise
-        raise InputFileError(f"{path}: not an NPZ file that can be read ({error})") from None
+    return npz_arrays(content, path)
 
 
 def _needed(arrays: Mapping[str, NDArray[Any]], name: str, path: Path) -> NDArray[Any]:
