@@ -18,6 +18,7 @@ from phasemark.data.export.card import Column, write_card
 from phasemark.data.export.samples import truth_columns
 from phasemark.data.frames.frame_set_file import FrameSet, Sample, SceneFrameSet
 from phasemark.data.measured.reading import RangeOrZ
+from phasemark.inputs.extras import needed
 
 VERSION = "v2.1"
 CHUNK = 1000
@@ -31,7 +32,7 @@ _NOT_MEASURED = ("coverage", "shares", "camera2world", "bodies2world", "class_of
 
 def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write episodes: a scene's steps, once for each frame of a view; of landmarks the frames of a view."""
-    arrow, parquet = _pyarrow()
+    arrow, parquet = (needed(module, "Parquet", "export") for module in ("pyarrow", "pyarrow.parquet"))
     episodes = list(_episodes(frames))
     if len(episodes) > MOST_EPISODES:
         raise UsageError(
@@ -81,24 +82,6 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     columns_of_card = [Column(name, one["dtype"], _shape(one)) for name, one in features.items()]
     load = 'LeRobotDataset("phasemark/frames", root="THIS FOLDER")  # or pandas.read_parquet of any episode'
     write_card(frames, folder, "LeRobot", columns_of_card, files, load)
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    """Return the modules that write Parquet.
-
-    Raises
-    ------
-    UsageError
-        The package pyarrow is not installed.
-    """
-    try:
-        import pyarrow
-        from pyarrow import parquet
-    except ImportError:
-        raise UsageError(
-            "Parquet needs the package pyarrow: pip install -e '.[export]' in the clone of phasemark"
-        ) from None
-    return pyarrow, parquet
 
 
 def _episodes(frames: FrameSet) -> Iterator[tuple[str, NDArray[np.int64]]]:

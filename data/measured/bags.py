@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import InputFileError, PhasemarkError
 from phasemark.data.measured.recording import Recording
 from phasemark.inputs import is_vouched_for
+from phasemark.inputs.extras import needed
 
 Z_TOPIC = "/camera/depth/image_rect"
 RANGE_TOPIC = "/camera/range/image"
@@ -26,13 +27,8 @@ def ros_types() -> Any:
     UsageError
         The package rosbags is not installed.
     """
-    try:
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise UsageError(
-            "ROS bags need the package rosbags: pip install -e '.[ros]' in the clone of phasemark"
-        ) from None
-    return get_typestore(Stores.ROS2_HUMBLE)
+    typesys = needed("rosbags.typesys", "ROS bags", "ros", verb="need")
+    return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
 def read_rosbag(path: Path, topic: str | None) -> Recording:

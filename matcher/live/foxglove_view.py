@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from phasemark import UsageError
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.status import Status
 from phasemark.matcher.live.updates import Update, plain_rows

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 from phasemark.matcher.live.sinks import Sink, planar_covariance
 from phasemark.matcher.live.updates import Update
 

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 
 from phasemark import InputFileError
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 from phasemark.matcher.live.sinks import Sink, open_output
 from phasemark.matcher.live.sources import Replay
 from phasemark.matcher.live.status import Status

@@ -6,7 +6,7 @@
 
 from typing import Any
 
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 
 _idl = needed("cyclonedds.idl", "the sink 'ros'", "dds")
 _types, _annotations = needed("cyclonedds.idl.types", "", "dds"), needed("cyclonedds.idl.annotations", "", "dds")

@@ -21,7 +21,7 @@ from phasemark.data.measured.boards import BOARDS, Board, find_board, recording_
 from phasemark.data.measured.csv_frames import parse_csv
 from phasemark.data.measured.reading import frames_of, read_frames, shape_before
 from phasemark.data.measured.recording import Recording
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 from phasemark.matcher.live.streams import Lines, Stream, address_of
 from phasemark.matcher.locate.recording import RigRecording
 from phasemark.render import Frames, Sensor

@@ -12,7 +12,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from phasemark import UsageError
-from phasemark.matcher.live.extras import needed
+from phasemark.inputs.extras import needed
 
 _CHUNK = 1 << 16
 _WAIT_S = 0.05

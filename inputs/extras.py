@@ -1,4 +1,4 @@
-"""Packages that sources and sinks need beside those of phasemark."""
+"""Packages of the optional extras, imported where they are needed."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Any
 from phasemark import UsageError
 
 
-def needed(module: str, purpose: str, extra: str) -> Any:
-    """Return a module of an optional package.
+def needed(module: str, purpose: str, extra: str, *, verb: str = "needs") -> Any:
+    """Return a module of an optional package; a message begins with the purpose and its verb.
 
     Raises
     ------
@@ -21,5 +21,5 @@ def needed(module: str, purpose: str, extra: str) -> Any:
     except ImportError:
         package = module.partition(".")[0]
         raise UsageError(
-            f"{purpose} needs the package {package}: pip install -e '.[{extra}]' in the clone of phasemark"
+            f"{purpose} {verb} the package {package}: pip install -e '.[{extra}]' in the clone of phasemark"
         ) from None
