@@ -46,21 +46,13 @@ class Sink(ABC):
 class JsonLines(Sink):
     """A line of JSON for each frame, into a file or standard output; degrees, as all of the program's JSON."""
 
-    def __init__(self, name: str, file: TextIO, *, with_status: bool = False) -> None:
+    def __init__(self, name: str, file: TextIO) -> None:
         super().__init__(name)
-        self._file, self._with_status = file, with_status
+        self._file = file
 
     def update(self, update: Update) -> None:
         """Write what is known."""
-        self._write(update.as_dict())
-
-    def status(self, status: Status) -> None:
-        """Write the status, if that was asked for."""
-        if self._with_status:
-            self._write({"status": status.as_dict()})
-
-    def _write(self, row: dict[str, Any]) -> None:
-        self._file.write(json.dumps(row, ensure_ascii=False, allow_nan=False) + "\n")
+        self._file.write(json.dumps(update.as_dict(), ensure_ascii=False, allow_nan=False) + "\n")
         self._file.flush()
 
     def close(self) -> None:
