@@ -11,7 +11,6 @@ with 95 %.
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import math
 import sys
@@ -26,6 +25,7 @@ from scipy import stats
 
 from phasemark import InputFileError, PhasemarkError
 from phasemark.data.files import write_atomically
+from phasemark.render.png import figure_png
 
 SHOWN = {
     "distance_m": ("D", "mm", 1e-3),
@@ -114,9 +114,7 @@ def main() -> int:
             title, unit, size = SHOWN[name]
             print(f"{title:8s} {match[name] / size:10.3f} ± {error / size:.2g} {unit}")
         arguments.out.parent.mkdir(parents=True, exist_ok=True)
-        buffer = io.BytesIO()
-        figure_of(match).savefig(buffer, format="png", dpi=110)
-        write_atomically(arguments.out, buffer.getvalue(), force=True)
+        write_atomically(arguments.out, figure_png(figure_of(match), dpi=110), force=True)
     except (PhasemarkError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code if isinstance(error, PhasemarkError) else InputFileError.exit_code

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-import io
 import math
 import re
 from typing import TYPE_CHECKING
 
 import jinja2
 from markupsafe import Markup
+
+from phasemark.render import png
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,9 +37,7 @@ def figure_png(figure: Figure) -> bytes:
         figure.set_dpi(dpi)
         engine.execute(figure)
         figure.set_layout_engine(None)  # or saving computes it once more in vain
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
-    return buffer.getvalue()
+    return png.figure_png(figure, dpi=dpi)
 
 
 def embedded_png(png: bytes, alternative: str) -> Markup:
