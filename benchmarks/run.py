@@ -49,25 +49,34 @@ SEED = 2005
 Table = dict[str, Any]
 
 
+def seconds_of(work: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
+    """Return the time of a piece of work by a clock."""
+    started = clock()
+    work()
+    return clock() - started
+
+
 def median_seconds(work: Callable[[], object], runs: int = 5) -> float:
     """Return the median time of a piece of work, after one run that is not counted."""
     work()
-    times = []
-    for _ in range(runs):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return statistics.median(times)
+    return statistics.median(seconds_of(work) for _ in range(runs))
 
 
 def processor_seconds(work: Callable[[], object], runs: int = 5) -> float:
     """Return the median processor time of a piece of work, all threads together: other programs hardly change it."""
-    times = []
-    for _ in range(runs):
-        started = time.process_time()
-        work()
-        times.append(time.process_time() - started)
-    return statistics.median(times)
+    return statistics.median(seconds_of(work, time.process_time) for _ in range(runs))
+
+
+def measured(code: str, *arguments: object) -> list[float]:
+    """Run a program in a process of its own; return the numbers in its last line and its peak memory in MiB."""
+    code = (
+        f"import os, re, sys, time; from pathlib import Path; {code};"
+        # what getrusage reports is never below the parent's memory at the fork
+        "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text()); print(int(peak[1]) / 1024)"
+    )
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    return [float(number) for number in done.stdout.splitlines()[-1].split()]
 
 
 def random_views(n: int, seed: int = SEED) -> Views:
@@ -201,20 +210,15 @@ def lenses() -> Table:
 def banks() -> Table:
     """Time the default banks; memory is the peak of a process that does nothing else."""
     code = (
-        "import re, sys, time; from pathlib import Path; from phasemark.data import BankPlan, build_bank;"
+        "from phasemark.data import BankPlan, build_bank;"
         "s = time.perf_counter(); build_bank(BankPlan(layout=sys.argv[1]), sys.argv[2]).close();"
-        # what getrusage reports is never below the parent's memory at the fork
-        "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text());"
-        "print(time.perf_counter() - s, int(peak[1]) / 1024)"
+        "print(time.perf_counter() - s, end=' ')"
     )
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for layout, images in (("factored", 141 * 180 + 4 * 141), ("full", 4 * 141 * 180)):
             path = Path(folder) / f"{layout}.h5"
-            done = subprocess.run(
-                [sys.executable, "-c", code, layout, str(path)], check=True, capture_output=True, text=True
-            )
-            seconds, mebibytes = map(float, done.stdout.split())
+            seconds, mebibytes = measured(code, layout, path)
             rows.append(
                 {
                     "bank": layout,
@@ -231,7 +235,6 @@ def banks() -> Table:
 def million() -> Table:
     """Build a million noisy frames with their truth, and say how much of the time is not spent on making them."""
     code = (
-        "import os, re, sys, time; from pathlib import Path;"
         "from phasemark.data import FramePlan, build_frames; from phasemark.data.frames.build_frames import FrameJob;"
         "from phasemark.data.shards.executor import processors, run_tasks;"
         "from phasemark.data.shards.build import SHARD_BYTES, make_shard;"
@@ -245,13 +248,11 @@ def million() -> Table:
         "some = range(0, plan.views - items, 10 * items); s = time.perf_counter();"
         "made = list(run_tasks(lambda k: len(make_shard(job, k, k + items)), some, processors()));"
         "making = (time.perf_counter() - s) * plan.views / (len(some) * items);"
-        "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text());"
-        "print(seconds, busy, making, int(peak[1]) / 1024)"
+        "print(seconds, busy, making, end=' ')"
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames.h5"
-        done = subprocess.run([sys.executable, "-c", code, str(path)], check=True, capture_output=True, text=True)
-        seconds, busy, making, mebibytes = map(float, done.stdout.split())
+        seconds, busy, making, mebibytes = measured(code, path)
         row = {
             "frames": 1_000_000,
             "seconds": round(seconds),
@@ -267,17 +268,15 @@ def million() -> Table:
 def sweep() -> Table:
     """Run the shipped sweep `paper`, 900 000 frames and their matches, with its report."""
     code = (
-        "import os, re, sys, time; from pathlib import Path; from phasemark.cli import main;"
+        "from phasemark.cli import main;"
         "main(['sweep', 'run', 'paper', '--trials', '2', '-o', sys.argv[1] + '/warm']);"
         "s = time.perf_counter(); c = sum(os.times()[:4]);"
-        "code = main(['sweep', 'run', 'paper', '-o', sys.argv[1] + '/paper']);"
+        "assert main(['sweep', 'run', 'paper', '-o', sys.argv[1] + '/paper']) == 0;"
         "seconds = time.perf_counter() - s; busy = sum(os.times()[:4]) - c;"
-        "peak = re.search(r'VmHWM:\\s+(\\d+)', Path('/proc/self/status').read_text());"
-        "print(seconds, busy, int(peak[1]) / 1024); sys.exit(code)"
+        "print(seconds, busy, end=' ')"
     )
     with tempfile.TemporaryDirectory() as folder:
-        done = subprocess.run([sys.executable, "-c", code, folder], check=True, capture_output=True, text=True)
-    seconds, busy, mebibytes = map(float, done.stdout.splitlines()[-1].split())
+        seconds, busy, mebibytes = measured(code, folder)
     row = {
         "sweep": "paper",
         "frames": 900_000,
