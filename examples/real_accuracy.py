@@ -19,7 +19,7 @@ import json
 import math
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,11 +90,11 @@ class StepError(Exception):
     """A command failed; its message is the command's own."""
 
 
-def run(*arguments: object) -> None:
-    """Run a command of phasemark quietly."""
+def run(*arguments: object, program: Callable[[list[str]], int] = phasemark) -> None:
+    """Run a command of phasemark, or another program, quietly."""
     error = io.StringIO()
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
-        code = phasemark([str(one) for one in arguments])
+        code = program([str(one) for one in arguments])
     if code:
         lines = error.getvalue().splitlines() or [f"error: exit code {code}"]
         raise StepError(next((line for line in lines if line.startswith("error: ")), lines[-1]))
@@ -110,10 +110,8 @@ class Panel:
 
     def split(self, path: Path) -> Path:
         """Split a recording; return the folder of its tables."""
-        out, error = self.folder / path.stem, io.StringIO()
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(error):
-            if split_recording.main([str(path), "--out", str(out)]):
-                raise StepError(error.getvalue().strip())
+        out = self.folder / path.stem
+        run(path, "--out", out, program=split_recording.main)
         return out
 
     def banks(self, name: str, size: Sequence[float], *options: object) -> Path:

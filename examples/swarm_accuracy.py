@@ -45,7 +45,7 @@ from phasemark.matcher.locate.wall_map import cut_at_crossings
 from phasemark.render.png import figure_png
 
 Floats = NDArray[np.float64]
-Row = Callable[["Run", Rig], tuple[Rig, list[LocatedPose]]]
+Row = Callable[["Run", Rig], list[LocatedPose]]
 
 MAP = {"thickness_m": 0.02, "position_std_m": 0.006, "yaw_std_deg": 0.35}
 """Walls have some thickness, stand up to 40 mm from where they are drawn, and may be off by this part as a whole."""
@@ -134,9 +134,9 @@ def starts(run: Run, position_m: float, yaw_deg: float) -> tuple[Floats, Floats]
     return run.truth + reach * rng.uniform(-1, 1, run.truth.shape), reach / math.sqrt(3)
 
 
-def near(run: Run, rig: Rig) -> list[LocatedPose]:
-    """Locate stops from starts ± 0.3 m and ± 10°."""
-    return Locator(run.wall_map, rig).locate(run.recording, *starts(run, 0.3, 10.0))
+def near(run: Run, rig: Rig, position_m: float = 0.3, yaw_deg: float = 10.0) -> list[LocatedPose]:
+    """Locate stops from starts that are off by up to so much."""
+    return Locator(run.wall_map, rig).locate(run.recording, *starts(run, position_m, yaw_deg))
 
 
 def rows() -> Iterator[tuple[str, Row]]:
@@ -147,32 +147,18 @@ def rows() -> Iterator[tuple[str, Row]]:
         stop = rig.stop if unknowns else type(rig.stop)(**NO_UNKNOWNS)
         return rig.model_copy(update={"sensor": sensors, "stop": stop})
 
-    def with_rig(change: Callable[[Rig], Rig]) -> Row:
-        return lambda run, rig: (change(rig), near(run, change(rig)))
-
-    yield "flat walls, centre rays, nominal rig", with_rig(lambda rig: changed(NOMINAL, THIN, False))
-    yield "+ unknowns of each stop", with_rig(lambda rig: changed(NOMINAL, THIN, True))
-    yield "+ footprint of 2.5 columns", with_rig(lambda rig: NOMINAL)
-    yield "+ calibrated rig", with_rig(lambda rig: rig)
-    yield "from odometry alone", lambda run, rig: (rig, Locator(run.wall_map, rig).follow(run.recording))
-    yield "from odometry, smoothed", lambda run, rig: (rig, joined(run, rig))
-    yield "one frame of 15", lambda run, rig: (rig, near(first_frame(run), rig))
-    yield (
-        "one frame, from odometry",
-        lambda run, rig: (
-            rig,
-            Locator(run.wall_map, rig).follow(first_frame(run).recording),
-        ),
-    )
-    yield (
-        "starts ± 1.2 m, ± 45°",
-        lambda run, rig: (
-            rig,
-            Locator(run.wall_map, rig).locate(run.recording, *starts(run, 1.2, 45.0)),
-        ),
-    )
-    yield "no start", lambda run, rig: (rig, Locator(run.wall_map, rig).locate(run.recording))
-    yield "no start, smoothed", lambda run, rig: (rig, joined(run, rig, anywhere=True))
+    plain, with_unknowns = changed(NOMINAL, THIN, False), changed(NOMINAL, THIN, True)
+    yield "flat walls, centre rays, nominal rig", lambda run, rig: near(run, plain)
+    yield "+ unknowns of each stop", lambda run, rig: near(run, with_unknowns)
+    yield "+ footprint of 2.5 columns", lambda run, rig: near(run, NOMINAL)
+    yield "+ calibrated rig", near
+    yield "from odometry alone", lambda run, rig: Locator(run.wall_map, rig).follow(run.recording)
+    yield "from odometry, smoothed", joined
+    yield "one frame of 15", lambda run, rig: near(first_frame(run), rig)
+    yield "one frame, from odometry", lambda run, rig: Locator(run.wall_map, rig).follow(first_frame(run).recording)
+    yield "starts ± 1.2 m, ± 45°", lambda run, rig: near(run, rig, 1.2, 45.0)
+    yield "no start", lambda run, rig: Locator(run.wall_map, rig).locate(run.recording)
+    yield "no start, smoothed", lambda run, rig: joined(run, rig, anywhere=True)
 
 
 def joined(run: Run, rig: Rig, anywhere: bool = False) -> list[LocatedPose]:
@@ -271,7 +257,7 @@ def measured(runs: Sequence[Run], rigs: dict[str, Rig], out: Path) -> Iterator[t
     for k, (name, row) in enumerate(rows()):
         score, everything = Score([], [], []), []
         for run in runs:
-            _, answers = row(run, rigs[run.name])
+            answers = row(run, rigs[run.name])
             pose, accepted = np.array([one.pose for one in answers]), np.array([one.accepted for one in answers])
             score.add(run, pose, np.nan_to_num(np.array([one.covariance for one in answers])), accepted)
             score.listed += listed(run, answers)
