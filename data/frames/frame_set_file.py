@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal
 
 import h5py
 import numpy as np
@@ -215,11 +215,7 @@ class FrameSet(StoredScene):
     def __len__(self) -> int:
         return len(self.view_index)
 
-    @overload
-    def __getitem__(self, index: int | np.integer) -> Sample: ...
-    @overload
-    def __getitem__(self, index: slice | Sequence[int] | NDArray[np.integer]) -> Sample: ...
-    def __getitem__(self, index: Any) -> Sample:
+    def __getitem__(self, index: int | np.integer | slice | Sequence[int] | NDArray[np.integer]) -> Sample:
         """Return the arrays and the truth of a frame, or of several with one more axis in front.
 
         Keys are ``range_m``, ``amplitude_e``, ``intensity_e``, ``flags``, ``taps_e``, ``range_shot_m``, ``coverage``,
@@ -229,8 +225,7 @@ class FrameSet(StoredScene):
         of bins behind the columns, and ``target_distance_m``, ``target_sigma_m``, ``target_signal`` and
         ``target_status``, with an axis of targets.
         """
-        one = isinstance(index, int | np.integer)
-        if one:
+        if isinstance(index, int | np.integer):
             n = len(self)
             if not -n <= index < n:
                 raise IndexError(f"frame {index} of {n}")
@@ -243,7 +238,7 @@ class FrameSet(StoredScene):
             sample[_key(name)] = self._checked(name, self._take(name, numbers if name in FRAME_FIELDS else views))
         sample["view"] = views
         sample |= self._truth_of(views)
-        if not one:
+        if not isinstance(index, int | np.integer):
             return sample
         return {key: values[0] if values.ndim > 1 else values[:1].tolist()[0] for key, values in sample.items()}
 
