@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from contextlib import ExitStack
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +84,8 @@ def produce(
     if resume and not begun and path.is_file():
         refuse_difference(path, finished(path), job.identity())
         return path
-    with ExitStack() as stack:
-        maker = open_maker(scheduler, job)
-        if maker is not None:
-            stack.callback(maker.close)
+    maker = open_maker(scheduler, job)
+    with nullcontext() if maker is None else closing(maker):
         return build(
             job, path, force=force, resume=resume, workers=workers, shard_items=shard_items, maker=maker,
             progress=progress,
