@@ -24,7 +24,7 @@ import trimesh
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from phasemark.data.measured.histogram_logs import read_histograms
+from phasemark.data.measured.histogram_logs import read_histograms, read_plane
 from phasemark.matcher.histograms import (
     ModelError,
     ObjectScene,
@@ -40,7 +40,6 @@ from phasemark.render.direct import (
     DirectFit,
     HistogramFrames,
     ObjectRecording,
-    PlaneRecording,
     SceneMesh,
     capture_histograms,
     expected_counts,
@@ -49,7 +48,6 @@ from phasemark.render.direct import (
     label_object,
     plane_samples,
     range_axis,
-    reference_centroid,
     support_height,
     world2cam,
     zone_transients,
@@ -101,18 +99,6 @@ def _pose(rng: np.random.Generator) -> NDArray[np.float64]:
     pose[:3, :3] = np.column_stack([x, np.cross(-away, x), -away])
     pose[:3, 3] = [0, 0, 0.06] + rng.uniform(-0.02, 0.02, 3) + 0.22 * away
     return pose
-
-
-def read_plane(folder: Path) -> PlaneRecording:
-    """Return the plane of a folder, as the preset's zones."""
-    base = preset("tmf8820-3x3")
-    log = read_histograms(folder / "ladder.npz", sensor=base)
-    if log.frames.reference is not None:
-        peak = float(reference_centroid(log.frames.reference.sum(axis=1))[-1])
-        base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
-        log = read_histograms(folder / "ladder.npz", sensor=base)
-    far = np.flatnonzero(log.distance_m >= NEAREST_M)
-    return PlaneRecording(log.frames[far], log.distance_m[far])
 
 
 def read_objects(folder: Path, base: Sensor) -> list[ObjectRecording]:
@@ -239,7 +225,7 @@ def main(arguments: list[str] | None = None) -> dict[str, object]:
         folder = options.out / "simulated"
         folder.mkdir(exist_ok=True)
         simulate(folder, rng)
-    plane = read_plane(folder)
+    plane = read_plane(folder / "ladder.npz", sensor=preset("tmf8820-3x3"), nearest_m=NEAREST_M)
     objects = read_objects(folder, plane.frames.sensor)
     seen = [np.arange(len(one.frames)) if options.others else split(len(one.frames))[0] for one in objects]
     calibrating = [one[k] for one, k in zip(objects, seen, strict=True)]

@@ -16,7 +16,7 @@ from phasemark.data.commands.outputs import refuse_existing, refuse_other_files,
 
 if TYPE_CHECKING:
     from phasemark.render import Sensor
-    from phasemark.render.direct import DirectFit, ObjectRecording, PlaneRecording
+    from phasemark.render.direct import DirectFit, ObjectRecording
 
 
 def sensor_fit_direct(
@@ -47,13 +47,18 @@ def sensor_fit_direct(
         Distances of the plane below this are left out.
     """
     from phasemark.data.files.same_file import refuse_inputs
+    from phasemark.data.measured.histogram_logs import read_plane
     from phasemark.render.direct import fit_direct_sensor
     from phasemark.render.sensor.sensor_file import sensor_toml
 
     refuse_other_files(out, ".toml", "the sensor")
     refuse_inputs([out], [Path(part) for text in known or [] for part in text.split(",")])
     refuse_existing([out], force)
-    base, recording = _plane(plane, sensor, nearest)
+    base = read_sensor(sensor)
+    if base.histogram is None:
+        raise UsageError(f"the sensor '{sensor}' has no [histogram] table: its histograms are not described")
+    recording = read_plane(plane, sensor=base, nearest_m=nearest)
+    base = recording.frames.sensor
     objects = [_object(text, base) for text in known or []]
     scores = _zone_orders(known, base)
     with LongWork("fitting"):
@@ -91,28 +96,6 @@ def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
         ("zone", "range r.m.s. (mm)", "chi2/nu"),
         ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread_mm, fit.reduced_chi2, strict=True))),
     )
-
-
-def _plane(path: Path, sensor: str, nearest_m: float) -> tuple[Sensor, PlaneRecording]:
-    """Return the sensor that a fit starts from, and the plane's histograms from `nearest_m` on."""
-    import numpy as np
-
-    from phasemark.data.measured.histogram_logs import read_histograms
-    from phasemark.render.direct import PlaneRecording, reference_centroid
-
-    base = read_sensor(sensor)
-    if base.histogram is None:
-        raise UsageError(f"the sensor '{sensor}' has no [histogram] table: its histograms are not described")
-    log = read_histograms(path, sensor=base)
-    if log.distance_m is None:
-        raise UsageError(f"{path} must state 'distance_m', the distance of the plane in each frame")
-    frames, distance_m = log.frames, log.distance_m
-    if frames.reference is not None and base.histogram.reference_peak is None:
-        peak = float(reference_centroid(frames.reference.sum(axis=1))[-1])
-        base = base.with_(histogram={**base.histogram.model_dump(), "reference_peak": peak})
-        frames = read_histograms(path, sensor=base).frames
-    far = np.flatnonzero(distance_m >= nearest_m)
-    return base, PlaneRecording(frames[far], distance_m[far])
 
 
 def _zone_orders(known: list[str] | None, base: Sensor) -> dict[str, float]:

@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import InputFileError, PhasemarkError
+from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
 from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, npz_arrays
 from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
-from phasemark.render.direct.histogram_frames import HistogramFrames
+from phasemark.render.direct.histogram_frames import HistogramFrames, reference_centroid
+from phasemark.render.direct.recordings import PlaneRecording
 from phasemark.render.direct.targets import Status, Targets
 
 _MOST_BYTES = 1 << 28
@@ -141,6 +142,37 @@ def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> Histogra
         poses[(poses[:, 3] == 0).all(axis=1), 3, 3] = 1.0
     distance = arrays.get("distance_m")
     return HistogramLog(frames, None if distance is None else distance.astype(np.float64), poses)
+
+
+def read_plane(path: str | os.PathLike[str], *, sensor: Sensor, nearest_m: float) -> PlaneRecording:
+    """Read the histograms of a plane from a distance on; a sensor without the peak of its reference gets the log's.
+
+    Parameters
+    ----------
+    path : path-like
+        Log with ``distance_m``.
+    sensor : Sensor
+        Camera with a [histogram] table.
+    nearest_m : float
+        Nearer frames are left out.
+
+    Raises
+    ------
+    UsageError
+        The log does not state the distance of the plane.
+    InputFileError
+        As :func:`read_histograms`.
+    """
+    log = read_histograms(path, sensor=sensor)
+    frames, distance_m, histogram = log.frames, log.distance_m, sensor.histogram
+    if distance_m is None:
+        raise UsageError(f"{path} must state 'distance_m', the distance of the plane in each frame")
+    if frames.reference is not None and histogram is not None and histogram.reference_peak is None:
+        peak = float(reference_centroid(frames.reference.sum(axis=1))[-1])
+        sensor = sensor.with_(histogram={**histogram.model_dump(), "reference_peak": peak})
+        frames = read_histograms(path, sensor=sensor).frames
+    far = np.flatnonzero(distance_m >= nearest_m)
+    return PlaneRecording(frames[far], distance_m[far])
 
 
 def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: Collection[int] = (5, 9)) -> Targets:
