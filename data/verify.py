@@ -161,7 +161,7 @@ def _check_values(file: h5py.File, path: Path) -> int:
 
 def _check_columns(file: h5py.File, path: Path, job: FramesJob[Any]) -> None:
     """Refuse columns, truth and splits among them, that are not what the plan draws."""
-    for name, expected in job.columns():
+    for name, expected, *_ in job.columns():
         stored = np.asarray(file[name][...])
         same = expected == stored if expected.dtype.kind in "iu" else _close(expected, stored)
         if stored.shape != expected.shape or not same.all():

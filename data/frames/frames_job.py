@@ -65,9 +65,9 @@ class FramesJob(SceneJob[P]):
 
     def lay_out_arrays(self, layout: Layout) -> list[list[Place]]:
         """Write coordinates and truth, and return where the large datasets go."""
-        file, per = layout.file, self.plan.frames_per_view
+        file = layout.file
         scales = {name: make_scale(file, name, *about) for name, *about in self.coordinates()}
-        for name, values, dims, attributes in self._small(self.plan.views, per):
+        for name, values, dims, attributes in self.columns():
             dataset = file.create_dataset(name, data=values)
             attach_scales(dataset, scales, dims)
             dataset.attrs.update(attributes)
@@ -105,14 +105,10 @@ class FramesJob(SceneJob[P]):
         }  # fmt: skip
         return "split", split, ("view",), attributes
 
-    def columns(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        """Yield name and values of every column of the file: which view each frame shows, and what is true of it."""
-        for name, values, _, _ in self._small(self.plan.views, self.plan.frames_per_view):
-            yield name, values
-
-    def _small(self, n: int, per: int) -> Iterator[Column]:
+    def columns(self) -> Iterator[Column]:
         """Yield the datasets that are written with the header: which view each frame shows, and what is true of it."""
-        frames = np.arange(n * per, dtype="<i8")
+        per = self.plan.frames_per_view
+        frames = np.arange(self.plan.views * per, dtype="<i8")
         yield "view_index", (frames // per).astype("<i8"), ("frame",), {"long_name": "view that the frame shows"}
         yield "seed_index", frames, ("frame",), {"long_name": "number of the frame in the run that drew its noise"}
         yield from self.truth_columns()
