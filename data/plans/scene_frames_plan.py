@@ -25,6 +25,7 @@ from phasemark.data.plans.frame_plan import (
 )
 from phasemark.data.plans.generated_scene import (
     GeneratedScene,
+    Generator,
     PlacedScene,
     class_of_body,
     generated,
@@ -306,39 +307,33 @@ class SceneSource:
 
     Attributes
     ----------
-    make : callable
-        Returns the scene of a number, from a random generator.
     sha256 : str
         Of the generator's module, or of the files.
     """
 
     def __init__(self, plan: SceneFramesPlan) -> None:
-        scenes = plan.scenes
-        name = scenes.generator
+        self.plan, scenes, name = plan, plan.scenes, plan.scenes.generator
+        self._program: Generator | None = None
         if name is None:
             self.sha256 = sha256_of_files([each.path for each in scenes.list])
-
-            def make(index: int, rng: np.random.Generator) -> GeneratedScene:
-                each = scenes.list[index]
-                return scene_of_file(each.path, each.up, [one.model_dump() for one in each.cameras], each.labels)
         else:
-            program, self.sha256 = imported_generator(name)
-
-            def make(index: int, rng: np.random.Generator) -> GeneratedScene:
-                return generated(program, name, index, rng, scenes.options)
-
+            self._program, self.sha256 = imported_generator(name)
         if scenes.source_sha256 not in (None, self.sha256):
             what = "listed files are" if name is None else f"module of the generator '{name}' is"
             raise UsageError(
                 f"the {what} not as it was when the plan was resolved: give the old one, or build the set again"
             )
-        self.plan, self.make = plan, make
 
     def generate(self, index: int) -> GeneratedScene:
         """Return a scene; see :meth:`SceneFramesPlan.generate`."""
         if not 0 <= index < self.plan.n_scenes:
             raise UsageError(f"scene {index} is not there: the plan has {self.plan.n_scenes}")
-        return self.make(index, stream(self.plan.seed, "scenes", index))
+        scenes = self.plan.scenes
+        if self._program is None:
+            each = scenes.list[index]
+            return scene_of_file(each.path, each.up, [one.model_dump() for one in each.cameras], each.labels)
+        rng = stream(self.plan.seed, "scenes", index)
+        return generated(self._program, str(scenes.generator), index, rng, scenes.options)
 
     def placed(self, index: int) -> PlacedScene:
         """Return a scene, checked.
