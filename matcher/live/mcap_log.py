@@ -50,19 +50,16 @@ class McapSink(Sink):
     def update(self, update: Update) -> None:
         """Write a frame with all that was concluded."""
         located = update.located
-        self._write("frames", update, {"index": update.number, **_frame_dict(cast(Frames, update.frames))})
+        self._write("frames", update.time_s, {"index": update.number, **_frame_dict(cast(Frames, update.frames))})
         match = {} if located.match is None else located.match.as_dict()
-        self._write("matches", update, {"index": update.number, "searched": located.searched, **match})
-        self._write("poses", update, update.as_dict())
+        self._write("matches", update.time_s, {"index": update.number, "searched": located.searched, **match})
+        self._write("poses", update.time_s, update.as_dict())
 
     def status(self, status: Status) -> None:
         """Write the status."""
-        self._message("status", time.time(), status.as_dict())
+        self._write("status", time.time(), status.as_dict())
 
-    def _write(self, topic: str, update: Update, row: dict[str, Any]) -> None:
-        self._message(topic, update.time_s, row)
-
-    def _message(self, topic: str, time_s: float, row: dict[str, Any]) -> None:
+    def _write(self, topic: str, time_s: float, row: dict[str, Any]) -> None:
         now = max(int(time_s * 1e9), 0)
         data = json.dumps(row, ensure_ascii=False, allow_nan=False).encode()
         self._writer.add_message(self._channels[topic], log_time=now, publish_time=now, data=data)
