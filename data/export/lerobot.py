@@ -79,7 +79,8 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     }
     (meta / "info.json").write_text(json.dumps(info, indent=4, ensure_ascii=False) + "\n", encoding="utf-8")
     files = [{"name": "data/*/*.parquet", "format": "application/x-parquet"}]
-    columns_of_card = [Column(name, one["dtype"], _shape(one)) for name, one in features.items()]
+    shapes = {name: () if one["shape"] == [1] else tuple(one["shape"]) for name, one in features.items()}
+    columns_of_card = [Column(name, one["dtype"], shapes[name]) for name, one in features.items()]
     load = 'LeRobotDataset("phasemark/frames", root="THIS FOLDER")  # or pandas.read_parquet of any episode'
     write_card(frames, folder, "LeRobot", columns_of_card, files, load)
 
@@ -121,10 +122,6 @@ def _feature(values: NDArray[Any]) -> dict[str, Any]:
     """Describe a column as ``meta/info.json`` does: one number or text has the shape (1,)."""
     kind = "string" if values.dtype.kind == "U" else values.dtype.name
     return {"dtype": kind, "shape": list(values.shape[1:]) or [1], "names": None}
-
-
-def _shape(feature: dict[str, Any]) -> tuple[int, ...]:
-    return () if feature["shape"] == [1] else tuple(feature["shape"])
 
 
 def _column(arrow: Any, values: NDArray[Any]) -> Any:
