@@ -61,14 +61,11 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
             warnings.warn(f"{path}: has no checksum '{beside}' beside it, so damage may go unnoticed", stacklevel=2)
     try:
         reason = refusal(path) if foreign else refusal(path, expansion=OWN_EXPANSION, free_bytes=OWN_FREE_BYTES)
+        if reason is None:
+            return h5py.File(path, "r")
     except Exception:  # whatever a damaged file makes h5py say
         raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
-    if reason is not None:
-        raise InputFileError(f"{path}: refused: {reason}")
-    try:
-        return h5py.File(path, "r")
-    except OSError:
-        raise InputFileError(f"{path}: damaged or cut off: HDF5 cannot open it") from None
+    raise InputFileError(f"{path}: refused: {reason}")
 
 
 @contextmanager
