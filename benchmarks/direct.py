@@ -29,8 +29,8 @@ def direct(seed: int, median_seconds: Callable[..., float]) -> dict[str, Any]:
     views = Views.broadcast(rng.uniform(0.8, 1.2, N_FRAMES), rng.uniform(0.0, math.pi, N_FRAMES))
     rows = []
 
-    def add(what: str, seconds: float, n: int = N_FRAMES) -> None:
-        rows.append({"what": what, "frames/s": float(f"{n / seconds:.3g}")})
+    def add(what: str, seconds: float, n: int = N_FRAMES, first: float | str = "") -> None:
+        rows.append({"what": what, "frames/s": float(f"{n / seconds:.3g}"), "first frame (s)": first})
 
     renderer = HistogramRenderer(build_mesh(catalog()["cone"]), sensor)
     add("expected histograms of views", median_seconds(lambda: renderer.render_views(views)))
@@ -52,15 +52,12 @@ def direct(seed: int, median_seconds: Callable[..., float]) -> dict[str, Any]:
                     matcher.match(frames[:1])
                     first = time.perf_counter() - start
                     what = f"matching on {on}, {len(classes)} class{'es' if classes[1:] else ''}"
-                    add(what, median_seconds(lambda m=matcher: m.match(frames), 3))
-                    rows[-1]["first frame (s)"] = round(first, 1)
-    rows[0]["first frame (s)"] = rows[1]["first frame (s)"] = ""
+                    add(what, median_seconds(lambda m=matcher: m.match(frames), 3), first=round(first, 1))
     add(
         "one frame as the chip reports it, alone, from array to pose",
         float(np.median(seconds_of_single_frames(rng))),
         1,
     )
-    rows[-1]["first frame (s)"] = ""
     return {"rows": rows}
 
 

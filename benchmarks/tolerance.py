@@ -55,7 +55,7 @@ def tolerance(sensor: Sensor, seed: int) -> dict[str, Any]:
     rows = []
     with tempfile.TemporaryDirectory() as folder, build_bank(BankPlan(), Path(folder) / "bank.h5") as bank:
         for title, make, made_with, options in cases:
-            image, options = make(), {"free": FREE[:2], **options}
+            image = make()
             frames = capture(image, made_with, rng=rng, n_frames=50, workers=2)
             # the matcher believes in the bank's sensor
             believed = replace(kalman_filter(frames), sensor=sensor)
