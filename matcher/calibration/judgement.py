@@ -215,9 +215,7 @@ def _other_quantities(problem: Problem) -> list[tuple[_Change, str]]:
 
 
 def _flipped(problem: Problem) -> Problem:
-    frames = problem.frames
-    flipped = {name: getattr(frames, name)[:, :, ::-1] for name in ("range_m", "std_m", "state", "n_effective")}
-    return replace(problem, frames=replace(frames, **flipped))
+    return replace(problem, frames=problem.frames.with_pixels(lambda values: values[..., ::-1]))
 
 
 def _in_order(problem: Problem, order: NDArray[np.integer]) -> Problem:

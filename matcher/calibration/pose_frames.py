@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -87,17 +87,12 @@ def filter_poses(frames: Sequence[Frames], on: Explained = "auto") -> FilteredFr
     parts = [phasor_mean(one) if coherent else kalman_filter(one) for one in frames]
     # frames without amplitudes of one pose from which their scatter is a better judge of noise than the noise law
     frames_for_scatter = 10
-    parts = [
-        _with_known_noise(part) if one.n_frames < frames_for_scatter else part
-        for part, one in zip(parts, frames, strict=True)
-    ]
-
-    joined: dict[str, Any] = {}
-    for name in ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective", "time_s", "tilt_rad"):
-        arrays = [getattr(part, name) for part in parts]
-        joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
-    scattered = any(part.std_from_scatter for part in parts)
-    return replace(parts[0], std_from_scatter=scattered, by_frequency=(), **joined)
+    return FilteredFrames.joined(
+        [
+            _with_known_noise(part) if one.n_frames < frames_for_scatter else part
+            for part, one in zip(parts, frames, strict=True)
+        ]
+    )
 
 
 def _with_known_noise(frames: FilteredFrames) -> FilteredFrames:

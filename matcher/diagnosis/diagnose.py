@@ -466,7 +466,8 @@ class _Trials:
     def _transformed(self) -> _Found:
         """Match the frame as other settings would have read it."""
         changed = list(_transforms(self.frame, self.bank))
-        matches = self.plain.match(_joined([frame for _, frame in changed]))
+        frames = FilteredFrames.joined([frame for _, frame in changed])
+        matches = self.plain.match(replace(frames, time_s=None))  # one frame does not move
         return [((change,), match) for (change, _), match in zip(changed, matches, strict=True) if self._counts(match)]
 
     def _transformed_with_bearing(self) -> _Found:
@@ -641,20 +642,6 @@ def _transforms(frame: FilteredFrames, bank: Bank) -> Iterator[tuple[Change, Fil
         if first / 2 < nearest * factor < last and farthest * factor < frame.sensor.unambiguous_range_m:
             words = f"ranges {factor:g} times as large" if factor > 1 else f"ranges {1 / factor:g} times smaller"
             yield Change("unit_factor", factor, words), _scaled(frame, np.full(cosine.shape, factor))
-
-
-_ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
-
-
-def _joined(frames: Sequence[FilteredFrames]) -> FilteredFrames:
-    """Return frames of one camera as a batch."""
-    first = frames[0]
-    arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(frame, name) for frame in frames])
-        for name in _ARRAYS
-        if getattr(first, name) is not None
-    }
-    return replace(first, time_s=None, **arrays)
 
 
 def _scaled(frame: FilteredFrames, factor: NDArray[np.float64]) -> FilteredFrames:

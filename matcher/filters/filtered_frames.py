@@ -128,6 +128,19 @@ class FilteredFrames:
         """Go through the positions, each a batch of one."""
         return (self[k] for k in range(len(self)))
 
+    @classmethod
+    def joined(cls, parts: Sequence[FilteredFrames]) -> FilteredFrames:
+        """Return the positions of several batches of one camera as one, without what each frequency measured.
+
+        A field that one of them lacks all lack; noise is from the scatter of the frames if that of any is.
+        """
+        joined: dict[str, Any] = {}
+        for name in (*_ARRAYS, "time_s", "tilt_rad"):
+            arrays = [getattr(part, name) for part in parts]
+            joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
+        scattered = any(part.std_from_scatter for part in parts)
+        return replace(parts[0], std_from_scatter=scattered, by_frequency=(), **joined)
+
     def with_pixels(self, move: Callable[[NDArray[Any]], NDArray[Any]]) -> FilteredFrames:
         """Return the frames with their pixels elsewhere: mirrored or turned images of the same camera."""
         parts = tuple(part.with_pixels(move) for part in self.by_frequency)
