@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -67,3 +68,29 @@ def toml_value(value: Any) -> str:
     "😀" [0.5, 2]
     """
     return str(tomlkit.item(value).as_string())
+
+
+def toml_text(content: Mapping[str, object]) -> str:
+    """Return a document as TOML, its lists after everything else: what follows a list of tables would belong to it.
+
+    Parameters
+    ----------
+    content : mapping of str to object
+        Keys with their values: plain values, tables as mappings, lists.
+
+    Returns
+    -------
+    str
+
+    Examples
+    --------
+    >>> print(toml_text({"wall": [{"height_m": 2.0}], "frame": "map"}).strip())
+    frame = "map"
+    <BLANKLINE>
+    [[wall]]
+    height_m = 2.0
+    """
+    document = tomlkit.document()
+    for key in sorted(content, key=lambda name: isinstance(content[name], list)):
+        document.add(key, tomlkit.item(content[key]))
+    return tomlkit.dumps(document)

@@ -14,6 +14,7 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel, read_plan, sensor_in_folder, sensor_of
+from phasemark.inputs.toml_file import toml_text
 from phasemark.matcher.locate.kernel_arguments import Outline, RigNumbers
 from phasemark.matcher.locate.plane import turn_of
 from phasemark.matcher.locate.wall_map import WallMap
@@ -267,18 +268,12 @@ class Rig(PlanModel):
 
     def to_toml(self) -> str:
         """Return the rig as the text of a file."""
-        import tomlkit
-
-        document = tomlkit.document()
         content = self.model_dump(mode="json", exclude_none=True)
-        sensors = content.pop("sensor")
-        for key, value in content.items():
-            document.add(key, tomlkit.item(value))
-        tables = tomlkit.aot()
-        for sensor in sensors:
-            tables.append(tomlkit.item({key: round(v, 7) if isinstance(v, float) else v for key, v in sensor.items()}))
-        document.add("sensor", tables)
-        return tomlkit.dumps(document)
+        content["sensor"] = [
+            {key: round(value, 7) if isinstance(value, float) else value for key, value in sensor.items()}
+            for sensor in content["sensor"]
+        ]
+        return toml_text(content)
 
 
 def read_rig(path: str | os.PathLike[str]) -> Rig:

@@ -14,7 +14,7 @@ from trimesh.intersections import mesh_plane
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.plans.bank_plan import PlanModel, plan_of_table
-from phasemark.inputs.toml_file import read_toml
+from phasemark.inputs.toml_file import read_toml, toml_text
 from phasemark.landmarks import build_mesh, catalog, read_mesh
 from phasemark.matcher.locate.kernel_arguments import Outline
 from phasemark.matcher.locate.plane import turn_of
@@ -302,13 +302,7 @@ class WallMap(PlanModel):
 
     def to_toml(self) -> str:
         """Return the map as the text of a file."""
-        import tomlkit
-
-        content = self.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True)
-        document = tomlkit.document()
-        for key in sorted(content, key=lambda name: isinstance(content[name], list)):
-            document.add(key, tomlkit.item(content[key]))
-        return tomlkit.dumps(document)
+        return toml_text(self.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True))
 
 
 def map_of_run(path: str | os.PathLike[str], name: str | None, run: str | None) -> str | None:
