@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ _Standing = tuple[list[Background | None], Fits]
 """What stands behind the landmark in each of n frames, and their fits before it."""
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class AutoBackground:
     """Searches n frames, each before the background that it shows; many at the same time.
 
@@ -62,20 +63,14 @@ class AutoBackground:
         Returns the scene without a background whose search leaves open whether there is one.
     """
 
-    def __init__(
-        self,
-        frames: FilteredFrames,
-        evidence: Evidence,
-        bare: NDArray[np.float64],
-        setup: Setup,
-        rendered: RenderedModel,
-        scene: _SceneOf,
-        whole_scene: _SceneOf,
-        open_scene: Callable[[], Scene],
-    ) -> None:
-        self._frames, self._evidence, self._bare, self._n = frames, evidence, bare, len(frames)
-        self._setup, self._rendered = setup, rendered
-        self._scene, self._whole_scene, self._open_scene = scene, whole_scene, open_scene
+    frames: FilteredFrames
+    evidence: Evidence
+    bare: NDArray[np.float64]
+    setup: Setup
+    rendered: RenderedModel
+    scene: _SceneOf
+    whole_scene: _SceneOf
+    open_scene: Callable[[], Scene]
 
     def search(self) -> _Standing:
         """Return the background of each frame, and what explains the frames before them."""
@@ -84,7 +79,7 @@ class AutoBackground:
         # 2  fit both in turn, where a fit is doubtful, and where pixels that see some of the landmark tell the
         #    height of a floor, or tilts
         entangled = [own is not None and (own.floor_m is not None or self._tilted) for own in backgrounds]
-        which = np.flatnonzero(np.array(entangled) | are_doubtful(self._setup, fits, self._n))
+        which = np.flatnonzero(np.array(entangled) | are_doubtful(self.setup, fits, len(self.frames)))
         backgrounds, fits = self._with_better_backgrounds(which, backgrounds, fits)
         # 3  search all pixels where that leaves a doubt: what was taken for background may be landmark
         which = self._doubtful(backgrounds, fits)
@@ -101,7 +96,7 @@ class AutoBackground:
         # 5  look how far the answers may be off
         parts = []
         for which in _without_and_with(backgrounds):
-            scene, some = self._scene(_standing(backgrounds, which)), self._evidence[which]
+            scene, some = self.scene(_standing(backgrounds, which)), self.evidence[which]
             own = with_valleys(scene, some, _of_frames(fits, which))
             parts.append(_numbered(with_profiles(scene, some, own), which))
         return backgrounds, Fits.joined(parts)
@@ -109,50 +104,50 @@ class AutoBackground:
     @property
     def _tilted(self) -> bool:
         """Whether pitch or roll is estimated."""
-        return bool(set(self._setup.free) & set(VIEW[4:]))
+        return bool(set(self.setup.free) & set(VIEW[4:]))
 
     def _doubtful(self, backgrounds: list[Background | None], fits: Fits) -> NDArray[np.int64]:
         """Return the frames before a background whose fits are doubtful."""
         stands = np.array([own is not None for own in backgrounds])
-        return np.flatnonzero(stands & are_doubtful(self._setup, fits, self._n))
+        return np.flatnonzero(stands & are_doubtful(self.setup, fits, len(self.frames)))
 
     def _first(self) -> _Standing:
         """Return what the far pixels of each frame show, and fits to its other pixels."""
-        around = [self._surroundings(k) for k in range(self._n)]
+        around = [self._surroundings(k) for k in range(len(self.frames))]
         backgrounds = [own.background for own in around]
         parts = []
         for which in _without_and_with(backgrounds):
-            some = self._evidence[which]
+            some = self.evidence[which]
             seen, behind = some.seen, _standing(backgrounds, which)
             if behind:
                 seen = without_background(seen, [around[k] for k in which])
-            fits = search_views(self._scene(behind), some, seen, self._bare[which])
+            fits = search_views(self.scene(behind), some, seen, self.bare[which])
             parts.append(_numbered(fits, which))
-            doubtful = np.flatnonzero(are_doubtful(self._setup, fits, len(which)))
+            doubtful = np.flatnonzero(are_doubtful(self.setup, fits, len(which)))
             if not behind and doubtful.size:  # each pixel at an edge may see a background that none sees alone
                 few, again = some[doubtful], which[doubtful]
-                fits = search_views(self._open_scene(), few, few.seen, self._bare[again])
+                fits = search_views(self.open_scene(), few, few.seen, self.bare[again])
                 parts.append(_numbered(fits, again))
         return backgrounds, Fits.joined(parts)
 
     def _surroundings(self, k: int) -> Surroundings:
         """Return what one frame shows behind the landmark; nothing where that leaves no room for one."""
-        setup = self._setup
+        setup = self.setup
         known = not setup.bearing_is_free or setup.bearing_has_prior
-        around = estimate_surroundings(self._frames, k, bearing_known=known, tilt_known=not self._tilted)
+        around = estimate_surroundings(self.frames, k, bearing_known=known, tilt_known=not self._tilted)
         if around.background is not None and not self._leaves_room(around.background):
             return replace(around, background=None)
         return around
 
     def _leaves_room(self, background: Background) -> bool:
         """Return True if a landmark has a place between the lens and a wall."""
-        nearest, farthest = self._rendered.with_background(background).limits(self._setup.bank.delta_rad)
+        nearest, farthest = self.rendered.with_background(background).limits(self.setup.bank.delta_rad)
         return bool((nearest < farthest).all())
 
     def _searched_together(self, which: NDArray[np.int64], backgrounds: list[Background | None]) -> Fits:
         """Search frames with their backgrounds in the images of the bank."""
-        some, scene = self._evidence[which], self._whole_scene(_standing(backgrounds, which))
-        return _numbered(search_views(scene, some, some.seen, self._bare[which]), which)
+        some, scene = self.evidence[which], self.whole_scene(_standing(backgrounds, which))
+        return _numbered(search_views(scene, some, some.seen, self.bare[which]), which)
 
     def _other_angles(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> Fits:
         """Fit frames from their best views turned to other angles; distance and bearing are found more easily."""
@@ -162,10 +157,10 @@ class AutoBackground:
         best = best_of_frame(own)
         n = 12  # angles that a frame before an estimated background is tried from where nothing else fits
         source = np.repeat(best, n - 1)
-        period = np.array([delta_period_rad(self._setup.rules.symmetry[c]) for c in own.class_index[source]])
+        period = np.array([delta_period_rad(self.setup.rules.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
-        scene, some = self._scene(_standing(backgrounds, which)), self._evidence[which]
+        scene, some = self.scene(_standing(backgrounds, which)), self.evidence[which]
         return _numbered(fit_views(scene, some, replace(own[source], view=view)), which)
 
     def _with_better_backgrounds(
@@ -179,7 +174,7 @@ class AutoBackground:
         found = self._in_turn(which[stands[which]], backgrounds, fits)
         without = which[~stands[which]]
         best = best_of_frame(fits)
-        nearest_m = np.zeros(self._n)
+        nearest_m = np.zeros(len(self.frames))
         nearest_m[fits.frame[best]] = fits.view[best, 0]
         for beyond_m in _WALLS_BEYOND_M:
             if not without.size:
@@ -188,9 +183,9 @@ class AutoBackground:
             for k in without:
                 tried[k] = Background(wall_m=float(nearest_m[k]) + beyond_m)
             there = self._in_turn(without, tried, fits)
-            least, news = (least_of_frame(standing[1], self._n)[without] for standing in (found, there))
+            least, news = (least_of_frame(standing[1], len(self.frames))[without] for standing in (found, there))
             found = _taken(found, there, without[news < least])
-            without = without[are_doubtful(self._setup, found[1], self._n)[without]]
+            without = without[are_doubtful(self.setup, found[1], len(self.frames))[without]]
         return found
 
     def _in_turn(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> _Standing:
@@ -201,10 +196,10 @@ class AutoBackground:
             which, moved, starts = self._moved_backgrounds(which, *found)
             if not which.size:
                 break
-            some, scene = self._evidence[which], self._scene(_standing(moved, which))
+            some, scene = self.evidence[which], self.scene(_standing(moved, which))
             settings = replace(scene.settings(), look_beside_rad=CLOSE_BY_RAD)
             again = refine(scene.final, some, starts, settings)
-            before = least_of_frame(found[1], self._n)[which]
+            before = least_of_frame(found[1], len(self.frames))[which]
             now = least_of_frame(again, len(which))
             found = _taken(found, (moved, _numbered(again, which)), which[now < before])
             which = which[now <= before - BETTER_COST]
@@ -233,8 +228,8 @@ class AutoBackground:
             if not own.size or background is None:
                 continue
             best = fits[own[np.argsort(fits.cost[own], kind="stable")][:MOST_REFINED]]
-            one, class_index = self._evidence[k : k + 1], int(best.class_index[0])
-            found, view = fit_background(self._rendered, one, class_index, best.view[0], self._setup.free, background)
+            one, class_index = self.evidence[k : k + 1], int(best.class_index[0])
+            found, view = fit_background(self.rendered, one, class_index, best.view[0], self.setup.free, background)
             if found == background or not self._leaves_room(found):
                 continue
             best.view[0] = view
