@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Literal, Protocol, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -48,13 +48,6 @@ from phasemark.render.direct.targets import Targets
 METHODS = ("nearest", "refine")
 _LEAST = 1e-9
 """Least standard deviation or tolerance, metres or radians: the square of a smaller one is lost in rounding."""
-
-
-class MatchMethod(Protocol):
-    """Interface of a method of matching."""
-
-    def match(self, frames: FilteredFrames) -> list[Match]:
-        """Return one answer for each of n filtered frames, whose range offset was taken off."""
 
 
 class Matcher:
@@ -237,7 +230,7 @@ class Matcher:
             unwraps = method == "refine" and on == "ranges" and not isinstance(background, Background)
             bank = OneFrequencyBank(bank, "combined" if unwraps else "stacked")
             self._one = bank.one
-        self._method: MatchMethod
+        self._method: LikelihoodMatcher | NearestMatcher
         if on == "reported" and (method != "refine" or bank.sensor.histogram is None):
             raise UsageError('on="reported" goes with method "refine" and a direct sensor with a [histogram] table')
         if on == "reported" and (background == "auto" or isinstance(background, Background)):

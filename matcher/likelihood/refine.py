@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,22 +36,8 @@ _PIXELS_AT_ONCE = 1 << 20
 """Of all candidates that are refined roughly together: their images with slopes take some hundred bytes a pixel."""
 _VIEWS_AT_ONCE = 512
 """Views whose costs are told together: their images stay in the processor's cache."""
-
-
-class Candidates(Protocol):
-    """Views of m candidates, (m, 6), with the frame that each explains and its class, (m,) int64."""
-
-    @property
-    def frame(self) -> NDArray[np.int64]:
-        """As an attribute."""
-
-    @property
-    def class_index(self) -> NDArray[np.int64]:
-        """As an attribute."""
-
-    @property
-    def view(self) -> NDArray[np.float64]:
-        """As an attribute."""
+Candidates = Fits | Starts
+"""Views of m candidates, (m, 6), with the frame that each explains and its class, (m,) int64."""
 
 
 def refine(
