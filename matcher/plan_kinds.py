@@ -71,8 +71,7 @@ def _read_scenes(path: str | os.PathLike[str]) -> SceneFramesPlan:
 def _read_sweep(path: str | os.PathLike[str]) -> SweepPlan:
     """Read the plan of a sweep, and refuse what its banks, cameras and views would be refused for."""
     plan = read_sweep_plan(path).resolve()
-    conditions = range(len(plan.conditions()))
-    SweepJob(plan, Round(0, tuple(conditions), 0, plan.trials)).check_views()
+    SweepJob(plan, Round.first_of(plan)).check_views()
     for method in plan.methods:
         bank = plan.bank_plan(method)
         BankJob(bank.model_copy(update={"distance_m": bank.distance_m[:1]})).check_views()
