@@ -202,10 +202,11 @@ class Problem:
 
     def summed(self, theta: NDArray[np.float64], use: NDArray[np.bool_], images: ModelImages) -> State:
         """Return the state of images that were rendered: compare them with the frames."""
-        sums = gauss_newton_sums(
-            images.phasor, images.slope, self.evidence, self.frame, use & self.settings.used, self.settings.huber
-        )
-        return State(theta, use, images, self.with_prior(sums, theta))
+        return State(theta, use, images, self.with_prior(self.sums(images, use & self.settings.used), theta))
+
+    def sums(self, images: ModelImages, use: NDArray[np.bool_]) -> Sums:
+        """Return the sums of images over some pixels, (m, pixels), without what was known before."""
+        return gauss_newton_sums(images.phasor, images.slope, self.evidence, self.frame, use, self.settings.huber)
 
     def prior_cost(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the whitened squared distance of parameters from what was known before, (m,)."""
@@ -222,14 +223,11 @@ class Problem:
         if not self.prior_weight.any():
             return sums
         cost, square = self.prior_cost(theta), np.diag(self.prior_weight)
+        sums = replace(sums, cost=sums.cost + cost, capped=sums.capped + cost)
         if sums.gradient.shape[1] < len(square):  # images without slopes
-            return replace(sums, cost=sums.cost + cost, capped=sums.capped + cost)
-        return Sums(
-            sums.cost + cost,
-            sums.capped + cost,
-            sums.gradient - self.prior_weight * self._from_prior(theta),
-            sums.information + square,
-        )
+            return sums
+        gradient = sums.gradient - self.prior_weight * self._from_prior(theta)
+        return replace(sums, gradient=gradient, information=sums.information + square)
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""

@@ -21,7 +21,7 @@ from phasemark.matcher.likelihood.contradictions import contradicted_pixels, out
 from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend, look_beside, settle
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
-from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
+from phasemark.matcher.likelihood.residuals import Evidence, Sums
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
     slopes_along_axes,
@@ -259,13 +259,9 @@ def _uncertainty(
 
 def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
     """Return the sums of solutions over all pixels, also those that do not give the view."""
-    settings = problem.settings
-    if settings.used.all():
+    if problem.settings.used.all():
         return state.sums
-    sums = gauss_newton_sums(
-        state.images.phasor, state.images.slope, problem.evidence, problem.frame, state.use, settings.huber
-    )
-    return problem.with_prior(sums, state.theta)
+    return problem.with_prior(problem.sums(state.images, state.use), state.theta)
 
 
 class _Pixels(NamedTuple):
@@ -308,10 +304,7 @@ def _p_values(
     its parameters.
     """
     edges = _at_edges(problem, state)
-    use, sensor = state.use & edges, problem.evidence
-    sums = gauss_newton_sums(
-        state.images.phasor, state.images.slope, sensor, problem.frame, use, problem.settings.huber
-    )
+    sums = problem.sums(state.images, state.use & edges)
     unit = np.outer(problem.scale, problem.scale)
     inverse = np.linalg.pinv(state.sums.information * unit, hermitian=True)
     fitted = np.einsum("mpq,mqp->m", inverse, sums.information * unit)
