@@ -190,6 +190,7 @@ class Matcher:
                 )
         if not 0 < false_alarm < 1:
             raise UsageError(f"'false_alarm' must be in (0, 1), got {false_alarm!r}")
+        limits = {"false_alarm": false_alarm, "tolerance_m": tolerance_m, "tolerance_rad": tolerance_rad}
         self.bank = bank
         self.method = method
         self.false_alarm = false_alarm
@@ -213,17 +214,7 @@ class Matcher:
             if free is None:
                 known["bearing_rad"] = bearing_std_rad or BEARING_STD_RAD
             self.free = VIEW[:3] if free is None else check_free(free)
-            self._direct = direct_method(
-                bank,
-                on,
-                background=behind,
-                free=free,
-                known=known,
-                false_alarm=false_alarm,
-                tolerance_m=tolerance_m,
-                tolerance_rad=tolerance_rad,
-                workers=workers,
-            )
+            self._direct = direct_method(bank, on, background=behind, free=free, known=known, workers=workers, **limits)
             return
         if len(bank.sensor.frequencies_hz) > 1:
             # mixed pixels have no range that the frequencies agree on, and before a background they are at every edge
@@ -256,13 +247,7 @@ class Matcher:
             raise UsageError(
                 "'free', 'on', 'pixels', 'robust' and an automatic background belong to method 'refine', not 'nearest'"
             )
-        self._method = NearestMatcher(
-            bank,
-            background=background,
-            false_alarm=false_alarm,
-            tolerance_m=tolerance_m,
-            tolerance_rad=tolerance_rad,
-        )
+        self._method = NearestMatcher(bank, background=background, **limits)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy and pickle a matcher as what it was made from."""
