@@ -280,6 +280,7 @@ def test_sheets_of_one_mesh_that_pass_through_one_another_are_cut_there():
     turned = sheet.copy()
     turned.vertices = corners @ Rotation.from_rotvec([0.0, 0.9, 0.5]).as_matrix().T
     both = trimesh.util.concatenate([sheet, turned])
+    assert isinstance(both, trimesh.Trimesh)
     bodies = [Body(mesh, 0.5, pose=placed((1, 0.02, 0))) for mesh in (sheet, turned)]
     apart = SceneRenderer(Scene(bodies), WIDE).phasors(placed()).phasor
     one = SceneRenderer(Scene([Body(both, 0.5, pose=placed((1, 0.02, 0)))]), WIDE).phasors(placed()).phasor
@@ -351,7 +352,7 @@ def test_small_and_flat_ellipsoids_return_the_light_of_their_surface(half_m, tol
         rotation = Rotation.random(random_state=number).as_matrix()
         pose = placed((1.5, 0.004 * number, -0.007), rotation)
         image = SceneRenderer(Scene([Body.ellipsoid(half_m, albedo=1.0, pose=pose)]), one).phasors(np.eye(4))
-        true = light_of_ellipsoid(half_m, pose, one.modulation_hz, 1000)
+        true = light_of_ellipsoid(half_m, pose, one.frequencies_hz[0], 1000)
         found = complex(image.phasor[0, 0, 0]) * (2 * math.tan(math.radians(2.86))) ** 2
         assert abs(found - true) < tolerance * abs(true)
 
