@@ -59,9 +59,9 @@ def test_a_matcher_holds_the_images_of_a_bank_once(path, options, share, monkeyp
 @pytest.mark.parametrize("options", [{}, {"background": WALL}], ids=["alone", "wall"])
 def test_templates_do_not_depend_on_how_many_images_are_read_together(path, options, monkeypatch):
     with open_bank(path) as bank:
-        together = Matcher(bank, **options)._method.pose  # type: ignore[attr-defined]
+        together = Matcher(bank, **options)._method.pose  # type: ignore[union-attr]
         small_parts(monkeypatch, 1 << 16)
-        apart = Matcher(bank, **options)._method.pose  # type: ignore[attr-defined]
+        apart = Matcher(bank, **options)._method.pose  # type: ignore[union-attr]
     for name in ("range_m", "may_return", "must_return", "mean_m"):
         np.testing.assert_array_equal(getattr(apart, name), getattr(together, name))
 
