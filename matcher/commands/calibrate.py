@@ -152,8 +152,7 @@ def calibrate_camera(
     from phasemark.matcher.calibration.known_poses import read_poses
 
     if rig_file is not None:
-        if fix is not None or sensor is not None or reading != FrameReading():
-            raise UsageError("--fix, --sensor and options of how frames are read do not go with --rig")
+        _refuse_with_rig(fix, sensor, reading)
         files, chosen = [Path(bank_or_class), *(frames or ())], None if free is None else _names(free)
         return calibrate_rig_file(rig_file, map_file, files, poses, chosen, out, write_distrusted, force, as_json)
     if not frames:
@@ -188,6 +187,12 @@ def calibrate_camera(
             progress=progress,
         )
     _write_calibration(found, out, figure, base_name, force, write_distrusted, as_json)
+
+
+def _refuse_with_rig(fix: str | None, sensor: str | None, reading: FrameReading) -> None:
+    """Refuse what says nothing of the sensors of a rig."""
+    if fix is not None or sensor is not None or reading != FrameReading():
+        raise UsageError("--fix, --sensor and options of how frames are read do not go with --rig")
 
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:
