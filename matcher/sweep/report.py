@@ -221,8 +221,10 @@ def _commands(plan: SweepPlan, folder: Path) -> list[str]:
     """Return two commands: run the sweep again into a new folder, and write this page from existing trials."""
     where = shlex.quote(str(folder))
     given, again = shlex.quote(str(folder / "plan.json")), shlex.quote(f"{folder}-again")
-    trust = " --trust-plan" if any(method.is_program for method in plan.methods) else ""
-    return [f"phasemark sweep run {given} --out {again}{trust}", f"phasemark sweep report {where}"]
+    run = f"phasemark sweep run {given} --out {again}"
+    if any(method.is_program for method in plan.methods):
+        run = f"phasemark sweep run {given} --out {again} --trust-plan"
+    return [run, f"phasemark sweep report {where}"]
 
 
 def _gallery(job: SweepJob) -> Iterator[dict[str, Any]]:
