@@ -126,7 +126,10 @@ def _solution(
     """Return the result of a fit; `estimated` are the pose errors found from the residuals, if they were."""
     poses, use = problem.poses, place.use
     information, scatter = fit.knowledge(place)
-    check_observable(information, fit.free, fit.scale, poses)
+    try:
+        check_observable(information, fit.free, fit.scale, poses)
+    except UsageError as error:  # all numbers could be determined where the fit began
+        raise AstrayError(str(error)) from None
     plain = covariance_of(information, fit.scale, weak="wide")
     dof, p_value, pose_chi2 = fit.dof(place), fit.p_value(place), (place.residual**2).sum(axis=1)
     covariance, expected, source = plain, float(max(dof, 1)), "the noise law"

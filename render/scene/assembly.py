@@ -292,7 +292,7 @@ def _inside(frame: int, name: str) -> UsageError:
 
 
 class _Curve(NamedTuple):
-    """Where two bodies pass through one another.
+    """Curve along which two bodies pass through one another.
 
     Parameters
     ----------
