@@ -23,6 +23,15 @@ def product(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np
     return np.asarray((first + second) + third)
 
 
+def composed(outer: NDArray[np.float64], inner: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rigid transforms, (…, 4, 4), that apply `inner` and then `outer`; the leading axes broadcast."""
+    out = np.zeros(np.broadcast_shapes(outer.shape, inner.shape))
+    out[..., :3, :] = product(outer[..., :3, :3], inner[..., :3, :])
+    out[..., :3, 3] += outer[..., :3, 3]
+    out[..., 3, 3] = 1.0
+    return out
+
+
 def tilt2level(pitch_rad: NDArray[np.float64], roll_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the rotations Ry(pitch) · Rx(roll) from a tilted to the level frame, (n, 3, 3).
 

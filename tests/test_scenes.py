@@ -261,6 +261,46 @@ def test_bodies_joined_into_one_keep_their_albedos_and_round_surfaces():
     np.testing.assert_allclose(image.coverage[0], shares.sum(axis=-1), atol=1e-3)
 
 
+def test_joined_bodies_are_what_they_are_made_of_also_joined_again_moved_and_changed():
+    rng = np.random.default_rng(4)
+    parts = [
+        Body.sphere(0.06, albedo=0.3), Body.sphere(0.05, albedo=0.3), Body.capsule(0.03, 0.1, albedo=0.3),
+        Body.box((0.05, 0.12, 0.04), albedo=0.3), Body(trimesh.creation.icosahedron().apply_scale(0.06), 0.3),
+    ]  # fmt: skip
+    poses = [placed(rng.uniform(-0.06, 0.06, 3), Rotation.random(random_state=rng).as_matrix()) for _ in parts]
+    parts = [replace(part, pose=pose) for part, pose in zip(parts, poses, strict=True)]
+    moves = [placed((1.0, 0.05 * k, 0.0), Rotation.from_rotvec([0.3 * k, 0.5, 0.2]).as_matrix()) for k in range(3)]
+    first = replace(Body.joined(parts[:3]), pose=placed((0.0, 0.0, 0.01)))
+    whole = Body.joined([first, *parts[3:]], "robot").with_gloss(specular=0.2)
+    lifted = [replace(part, pose=placed((0.0, 0.0, 0.01)) @ part.pose) for part in parts[:3]] + parts[3:]
+    apart = [part.with_gloss(specular=0.2) for part in lifted]
+    scene, many = Scene([whole, Body.plane((0.4, 0.4), name="table")]), Scene([*apart, Body.plane((0.4, 0.4))])
+    table = placed((1.3, 0.0, -0.2))
+    images = SceneRenderer(scene, WIDE).phasors([placed()] * 3, {"robot": moves, "table": table})
+    where = np.array([[*(move @ part.pose for part in apart), table] for move in moves])
+    expected = SceneRenderer(many, WIDE).phasors([placed()] * 3, where)
+    np.testing.assert_allclose(images.phasor, expected.phasor, atol=1e-9 * np.abs(expected.phasor).max())
+    np.testing.assert_allclose(images.shares[..., 0], expected.shares[..., :-1].sum(axis=-1), atol=1e-9)
+    with pytest.raises(UsageError, match="frame 0 the lens is inside body 'robot'"):
+        SceneRenderer(scene, WIDE).phasors(apart[0].pose)
+    flat = SceneRenderer(Scene([replace(whole, smooth=False, pose=moves[0])]), WIDE).phasors(placed()).phasor
+    facets = [replace(part, smooth=False, pose=moves[0] @ part.pose) for part in apart]
+    sides = SceneRenderer(Scene(facets), WIDE).phasors(placed()).phasor
+    np.testing.assert_allclose(flat, sides, atol=1e-9 * np.abs(sides).max())
+
+
+def test_a_joined_body_whose_mesh_was_changed_is_that_mesh():
+    ball = Body.sphere(0.1, albedo=0.5)
+    joined = Body.joined([ball, replace(ball, pose=placed((0.0, 0.12, 0.0)))])
+    joined.mesh.vertices = np.asarray(joined.mesh.vertices) * [1.0, 1.5, 0.7]
+    mesh = Body(trimesh.Trimesh(joined.mesh.vertices, joined.mesh.faces, process=False), 0.5)
+    image, expected = (
+        SceneRenderer(Scene([replace(body, pose=placed((1, 0, 0)))]), WIDE).phasors(placed()).phasor
+        for body in (joined, mesh)
+    )
+    np.testing.assert_array_equal(image, expected)
+
+
 @pytest.mark.parametrize("angle_deg", [5, 20, 28, 60])
 def test_faces_of_joined_boxes_that_meet_at_a_small_angle_are_flat(angle_deg):
     half = math.radians(angle_deg) / 2

@@ -149,8 +149,8 @@ class MeshTopology(NamedTuple):
         raw = np.asarray(mesh.vertices, dtype=np.float64)
         if not np.isfinite(raw).all():
             raise UsageError("the mesh has a vertex that is not finite")
-        vertices, merged = np.unique(raw + 0.0, axis=0, return_inverse=True)
-        faces = merged.reshape(-1)[np.asarray(mesh.faces, dtype=np.int64)]
+        vertices, merged = _distinct(raw)
+        faces = merged[np.asarray(mesh.faces, dtype=np.int64)]
         part = np.asarray(mesh.face_attributes.get("part", _part_by_height(raw, mesh.faces)), dtype=np.int32)
         albedo = np.asarray(mesh.face_attributes.get("albedo", np.ones(len(faces))), dtype=np.float64)
         quadric = np.asarray(mesh.face_attributes.get("quadric", np.full(len(faces), -1)), dtype=np.int32)
@@ -194,8 +194,8 @@ class MeshTopology(NamedTuple):
         six_volumes = np.bincount(
             shell, np.einsum("ij,ij->i", a, np.cross(vertices[faces[:, 1]], vertices[faces[:, 2]]))
         )
-        _, solid = np.unique(np.column_stack([united, shell]), axis=0, return_inverse=True)
-        round_solid = np.where(quadric >= 0, solid.reshape(-1), -1)
+        _, solid = np.unique(united * (shell.max() + 1) + shell, return_inverse=True)
+        round_solid = np.where(quadric >= 0, solid, -1)
         closed = bool(regular.all() and (six_volumes > 0).all())
         return cls(
             vertices=np.ascontiguousarray(vertices),
@@ -285,6 +285,16 @@ def in_lines(rows: NDArray[Any]) -> NDArray[np.float32]:
     lines = room[begin : begin + 64 * len(rows)].view(np.float32).reshape(-1, 16)
     lines[:, : rows.shape[1]], lines[:, rows.shape[1] :] = rows, 0.0
     return lines
+
+
+def _distinct(points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return points without repetition, in order, and the number of each among them; NumPy's `unique` is slow in 3D."""
+    order = np.lexsort(points.T[::-1])
+    is_new = np.ones(len(points), np.bool_)
+    is_new[1:] = (np.diff(points[order], axis=0) != 0).any(axis=1)
+    number = np.empty(len(points), np.int64)
+    number[order] = np.cumsum(is_new) - 1
+    return points[order[is_new]] + 0.0, number
 
 
 def _part_by_height(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.int32]:

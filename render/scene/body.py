@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.render.integral.surface_mesh import SurfaceMesh
-from phasemark.render.rigid import product, rigid_transforms
+from phasemark.render.rigid import composed, rigid_transforms
 from phasemark.render.scene.solids import Solid
 
 SEGMENTS = 96
@@ -37,8 +37,9 @@ class Surface:
         if not isinstance(body.albedo, float):
             attributes["albedo"] = body.albedo
         metadata: dict[str, Any] = {}
-        if body.smooth and body.quadrics is not None:
-            attributes["quadric"], metadata["quadrics"] = body.quadrics
+        own = body.primitive
+        if body.smooth and own is not None and own.has_faces_of(body.mesh):
+            attributes["quadric"], metadata["quadrics"] = own.solid.quadric[own.face], own.solid.quadrics
         return cls(
             np.asarray(body.mesh.vertices, np.float64), np.asarray(body.mesh.faces, np.int64), attributes, metadata
         )
@@ -69,6 +70,10 @@ class Primitive(NamedTuple):
         """Return True if a mesh is still the one that was made."""
         return np.array_equal(mesh.vertices, self.vertices) and np.array_equal(mesh.faces, self.faces)
 
+    def has_faces_of(self, mesh: SurfaceMesh) -> bool:
+        """Return True if a mesh is still the one that was made, or that one turned inside out."""
+        return np.array_equal(mesh.vertices, self.vertices) and np.array_equal(np.sort(mesh.faces), np.sort(self.faces))
+
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -94,12 +99,11 @@ class Body:
     smooth : bool
         Whether normals are interpolated between faces that meet at less than 30°, as on a mesh that stands for a curved
         surface; False: every facet is flat.
-    quadrics : tuple, optional
-        Of round meshes: which quadric is the true surface of each face, (f,) int32, −1 for none, and the quadrics,
-        (q, 10), as :class:`~phasemark.render.integral.mesh_topology.MeshTopology` has them.
     primitive : Primitive, optional
         What the mesh stands for: the box, ellipsoid, cylinder or capsule that it was made of is rendered in its place
         as long as nobody changes the mesh, or its facets (`albedo` of each, `smooth`).
+    parts : tuple of Body
+        What was joined, if there are primitives in it: rendered in place of the mesh as long as nobody changes that.
     retroreflecting : float
         s_r, at all angles: 1 is a white Lambertian face seen head on, and sheeting returns hundreds.
     specular : float
@@ -126,8 +130,8 @@ class Body:
     name: str = ""
     pose: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
     smooth: bool = True
-    quadrics: tuple[NDArray[np.int32], NDArray[np.float64]] | None = field(default=None, repr=False)
     primitive: Primitive | None = field(default=None, repr=False)
+    parts: tuple[Body, ...] = field(default=(), repr=False)
     retroreflecting: float = 0.0
     specular: float = 0.0
     shininess: float = 32.0
@@ -198,6 +202,19 @@ class Body:
             return None
         return own.solid if own.is_of(self.mesh) else None
 
+    def pieces(self) -> list[Body]:
+        """Return what is rendered in place of the body: its parts, each where it stands in the body, or the body."""
+        vertices, faces = _put_together(self.parts)
+        if not (np.array_equal(self.mesh.vertices, vertices) and np.array_equal(self.mesh.faces, faces)):
+            return [replace(self, pose=np.eye(4))]
+        pieces, end = [], 0
+        for part in self.parts:
+            begin, end = end, end + len(part.mesh.faces)
+            gloss = {key: getattr(self, key) for key in ("retroreflecting", "specular", "shininess")}
+            albedo = self.albedo if isinstance(self.albedo, float) else _one_if_equal(self.albedo[begin:end])
+            pieces.append(replace(part, albedo=albedo, name=self.name, smooth=self.smooth, **gloss))
+        return pieces
+
     def named(self, name: str) -> Body:
         """Return the body under another name."""
         return replace(self, name=name)
@@ -241,25 +258,19 @@ class Body:
         parts = list(bodies)
         if len({(part.smooth, part.retroreflecting, part.specular, part.shininess) for part in parts}) != 1:
             raise UsageError("bodies that are joined must be at least one, and agree in 'smooth' and in gloss")
-        n_faces = [len(part.mesh.faces) for part in parts]
-        first = np.cumsum([0, *(len(part.mesh.vertices) for part in parts)])
-        vertices = [trimesh.transform_points(np.asarray(part.mesh.vertices), part.pose) for part in parts]
-        faces = [np.asarray(part.mesh.faces) + begin for part, begin in zip(parts, first, strict=False)]
-        albedo = np.concatenate([np.broadcast_to(part.albedo, n) for part, n in zip(parts, n_faces, strict=True)])
-        which, quadrics = [], [np.zeros((0, 10))]
-        for part, n in zip(parts, n_faces, strict=True):
-            own, known = part.quadrics or (np.full(n, -1), quadrics[0])
-            which.append(np.where(own >= 0, own + sum(map(len, quadrics)), -1))
-            quadrics.append(turned_quadrics(known, part.pose[:3, :3].T, part.pose[:3, 3]))
-        one = (albedo == albedo[0]).all()
+        pieces = tuple(
+            replace(piece, pose=composed(part.pose, piece.pose)) for part in parts for piece in part.pieces()
+        )
+        vertices, faces = _put_together(pieces)
+        albedo = np.concatenate([np.broadcast_to(piece.albedo, len(piece.mesh.faces)) for piece in pieces])
         return replace(
             parts[0],
-            mesh=trimesh.Trimesh(np.concatenate(vertices), np.concatenate(faces), process=False),
-            albedo=float(albedo[0]) if one else albedo,
+            mesh=trimesh.Trimesh(vertices, faces, process=False),
+            albedo=_one_if_equal(albedo),
             name=name,
             pose=np.eye(4),
-            quadrics=(np.concatenate(which).astype(np.int32), np.concatenate(quadrics)),
             primitive=None,
+            parts=pieces if any(piece.primitive for piece in pieces) else (),
         )
 
     @classmethod
@@ -423,23 +434,26 @@ class Body:
         face: ArrayLike = (),
     ) -> Body:
         """Return a body of a mesh that stands for a solid."""
-        true, own = None, None
+        own = None
         if solid is not None:
-            number = np.asarray(face, np.int64)
-            true = solid.quadric[number], solid.quadrics
-            own = Primitive(solid, number, np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64))
-        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), quadrics=true, primitive=own)
+            vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+            own = Primitive(solid, np.asarray(face, np.int64), vertices, faces)
+        return cls(mesh, albedo, name, np.eye(4) if pose is None else np.asarray(pose), primitive=own)
 
 
-def turned_quadrics(
-    quadrics: NDArray[np.float64], transposed: NDArray[np.float64], offset: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return quadrics, (q, 10), of a body that was turned and moved."""
-    square = product(product(transposed.T, quadrics[:, [[0, 3, 4], [3, 1, 5], [4, 5, 2]]]), transposed)
-    own = product(quadrics[:, None, 6:9], transposed)[:, 0]
-    linear = own - product(square, offset[:, None])[..., 0]
-    constant = quadrics[:, 9] - product((linear + own)[:, None], offset[:, None])[:, 0, 0]
-    return np.column_stack([square[:, [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]], linear, constant])
+def _put_together(bodies: Iterable[Body]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return vertices and faces of bodies where they stand, one after another."""
+    vertices, faces, first = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], 0
+    for body in bodies:
+        vertices.append(trimesh.transform_points(np.asarray(body.mesh.vertices), body.pose))
+        faces.append(np.asarray(body.mesh.faces) + first)
+        first += len(vertices[-1])
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _one_if_equal(albedo: NDArray[np.float64]) -> float | NDArray[np.float64]:
+    """Return one albedo if all faces have the same."""
+    return float(albedo[0]) if (albedo == albedo[0]).all() else albedo
 
 
 def _lengths(values: ArrayLike, n: int, name: str) -> NDArray[np.float64]:

@@ -30,7 +30,7 @@ def crossings(
         Metres.
     faces : (f, 3) int32
     others : (g, 3) int32
-        Of the other body.
+        Of the other body; `faces` itself: pairs of one body are found at least once, the lower number first.
 
     Returns
     -------
@@ -44,7 +44,7 @@ def crossings(
     room = 64
     while True:
         ends, pairs = np.empty((room, 2, 3)), np.empty((room, 2), np.int64)
-        n = _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs)
+        n = _cross(vertices, faces, others, blocks, other_blocks, touch, others is faces, ends, pairs)
         if n <= room:
             return ends[:n], pairs[:n]
         room = n
@@ -158,14 +158,14 @@ def _reaching(vertices, faces, block, bounds, found):  # type: ignore[no-untyped
 
 
 @njit(cache=True, nogil=True)
-def _cross(vertices, faces, others, blocks, other_blocks, touch, ends, pairs):  # type: ignore[no-untyped-def]
+def _cross(vertices, faces, others, blocks, other_blocks, touch, once, ends, pairs):  # type: ignore[no-untyped-def]
     """Write the segments along which triangles cross; return how many there are, also beyond the room for them."""
     count = 0
     inside, beyond, height, at = np.empty((2, 3)), np.empty((2, 3)), np.empty(3), np.empty(2)
     own, other = np.empty(_BLOCK, np.int64), np.empty(_BLOCK, np.int64)
     a, b = np.empty((3, 3)), np.empty((3, 3))
     for p in range(len(blocks)):
-        for q in range(len(other_blocks)):
+        for q in range(p if once else 0, len(other_blocks)):
             apart = False
             for k in range(3):
                 apart = apart or blocks[p, 1, k] < other_blocks[q, 0, k] or blocks[p, 0, k] > other_blocks[q, 1, k]

@@ -22,7 +22,7 @@ from phasemark.render.integral.mesh_topology import NO_GLOSS, MeshTopology
 from phasemark.render.integral.ray_plan import UNTRUSTED
 from phasemark.render.integral.scene_samples import SceneMesh
 from phasemark.render.phasor_images import PhasorImages
-from phasemark.render.rigid import product, rigid_transforms
+from phasemark.render.rigid import composed, product, rigid_transforms
 from phasemark.render.scene.assembly import Assembly
 from phasemark.render.scene.scene import Scene
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
@@ -95,7 +95,15 @@ class SceneRenderer:
         if rays is not None and (not isinstance(rays, int) or not 1 <= rays <= _MOST_RAYS):
             raise UsageError(f"'rays' must be a whole number from 1 to {_MOST_RAYS} a side of a pixel, got {rays!r}")
         self._rays = rays or 0
-        self._assembly = Assembly(scene.bodies, intersector, crosses=not self._rays)
+        pieces = [body.pieces() for body in scene]
+        placed = [
+            replace(piece, pose=composed(body.pose, piece.pose))
+            for body, own in zip(scene, pieces, strict=True)
+            for piece in own
+        ]
+        self._owner = np.repeat(np.arange(len(scene)), [len(own) for own in pieces])
+        self._in_body = np.array([piece.pose for own in pieces for piece in own])
+        self._assembly = Assembly(placed, intersector, crosses=not self._rays)
         self.bounces = bounces
         self.bounce_tolerance = bounce_tolerance
         self.untrusted_pixels = 0
@@ -180,13 +188,17 @@ class SceneRenderer:
         UsageError
             No body has that name, or as for :meth:`render`.
         """
-        free = np.arange(len(self.scene)) == self.scene.index(name)
+        free = self._owner == self.scene.index(name)
         return [self._images(sums) for sums in self._sums(camera2world, bodies2world, None, workers, free)]
 
     def _images(self, sums: Sums) -> PhasorImages:
         images = images_of_sums(sums, self.sensor, self._harmonics)
-        shares = np.minimum(sums.shares.reshape(*sums.state.shape, -1), 1.0)
-        return replace(images, shares=shares, bodies=self.scene.names)
+        return replace(images, shares=self._of_bodies(sums.shares, sums.state.shape), bodies=self.scene.names)
+
+    def _of_bodies(self, shares: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
+        """Return what bodies fill of pixels, (*shape, b), from what their pieces fill."""
+        first = np.searchsorted(self._owner, np.arange(len(self.scene)))
+        return np.minimum(np.add.reduceat(shares.reshape(*shape, -1), first, axis=-1), 1.0)
 
     def _sums(
         self,
@@ -196,7 +208,7 @@ class SceneRenderer:
         workers: int,
         free: NDArray[np.bool_] | None = None,
     ) -> list[Sums]:
-        """Return the sums of all pixels, or those of each power of the albedo of bodies that are free, (b,)."""
+        """Return the sums of all pixels, or those of each power of the albedo of pieces that are free."""
         cameras = rigid_transforms(camera2world, "camera2world")
         n, b = self._counts(cameras)
         if self.bounces and background is not None:
@@ -279,13 +291,13 @@ class SceneRenderer:
             detected_counts(signal, sensor).reshape(*shape, -1),
             signal.sum(axis=-1).reshape(shape),
             sensor,
-            shares=shares.reshape(*shape, b),
+            shares=self._of_bodies(shares, shape),
             bodies=self.scene.names,
         )
 
     def _counts(self, cameras: NDArray[np.float64]) -> tuple[int, int]:
-        """Return how many frames and bodies there are; refuse more than fit into memory."""
-        n, b = len(cameras), len(self.scene)
+        """Return how many frames and pieces of bodies there are; refuse more than fit into memory."""
+        n, b = len(cameras), len(self._owner)
         pixels = self.sensor.rows * self.sensor.cols
         if 8 * n * b * pixels > _MOST_BYTES:
             raise UsageError(
@@ -312,15 +324,16 @@ class SceneRenderer:
             alike.setdefault(placings[k].tobytes(), []).append(k)
         frames = [np.array(which) for which in alike.values()]
         if len(frames) > 1:
-            self._assembly.let_move((placings != placings[0]).any(axis=(0, 2, 3)))
+            self._assembly.let_move((placings != placings[0]).any(axis=(0, 2, 3))[self._owner])
+        names = [self.scene.names[b] for b in self._owner]
         lanes = [lane for i in range(min(workers, len(frames))) if (lane := frames[i::workers])]
         threads = max(workers // max(len(lanes), 1), 1)
 
         def run(lane: list[NDArray[np.int64]]) -> None:
             assembly = self._assembly if len(lanes) == 1 else self._assembly.copy()
             for which in lane:
-                assembly.place(placings[which[0]])
-                assembly.check_outside(cameras[which, :3, 3], self.scene.names, which)
+                assembly.place(composed(placings[which[0], self._owner], self._in_body))
+                assembly.check_outside(cameras[which, :3, 3], names, which)
                 use(assembly, which, self._poses(assembly, cameras[which], background), threads)
 
         mapped(run, lanes, len(lanes))

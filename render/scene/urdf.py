@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from phasemark import InputFileError
+from phasemark.render.rigid import composed
 from phasemark.render.scene.body import Body
 from phasemark.render.scene.mesh_files import bodies_of_trimesh, loaded_meshes
 
@@ -83,7 +84,7 @@ def _link_poses(robot: ElementTree.Element, path: Path) -> dict[str, NDArray[np.
         for _ in names:
             if link in above:
                 link, step = above[link]
-                pose = (step[:, :, None] * pose).sum(axis=1)  # BLAS may round otherwise elsewhere
+                pose = composed(step, pose)
         if link in above:
             raise InputFileError(f"{path}: the joints above link '{name}' form a ring")
         poses[name] = pose
