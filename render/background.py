@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.kernel import kernel
-from phasemark.render.view import FARTHEST_M, Views
+from phasemark.render.view import FARTHEST_M, Footprint, Views
 
 BOUNCES = 4
 """Column of the number of bounces among the parameters of a background."""
@@ -95,13 +95,12 @@ class Background:
         bounces = math.inf if self.bounces == "all" else self.bounces
         return np.array([self.wall_m or 0.0, self.floor_m or 0.0, self.wall_albedo, self.floor_albedo, bounces])
 
-    def check_behind(self, vertices: NDArray[np.float64], views: Views) -> None:
+    def check_behind(self, landmark: Footprint, views: Views) -> None:
         """Refuse a wall before, or a floor above, any point of the landmark.
 
         Parameters
         ----------
-        vertices : (v, 3) float64
-            Points of the landmark, landmark frame.
+        landmark : Footprint
         views : Views
             Views of the landmark.
 
@@ -110,17 +109,16 @@ class Background:
         UsageError
             Naming the view and what would be right.
         """
-        check_behind(parameters_of_views(self, len(views)), vertices, views)
+        check_behind(parameters_of_views(self, len(views)), landmark, views)
 
-    def giving_way(self, vertices: NDArray[np.float64], views: Views) -> Background:
+    def giving_way(self, landmark: Footprint, views: Views) -> Background:
         """Return it with wall and floor moved back to where they touch the landmark, if they would cut it.
 
         For views that are only tried: a landmark may stand on the floor, and a search must be free to lower it.
 
         Parameters
         ----------
-        vertices : (v, 3) float64
-            Points of the landmark, landmark frame.
+        landmark : Footprint
         views : Views
             Views of the landmark.
 
@@ -128,7 +126,7 @@ class Background:
         -------
         Background
         """
-        farthest, deepest = _extremes(self.wall_m or 0.0, vertices, views)
+        farthest, deepest = _extremes(self.wall_m or 0.0, landmark, views)
         return replace(
             self,
             wall_m=None if self.wall_m is None else max(self.wall_m, float(farthest.max(initial=0.0))),
@@ -169,10 +167,10 @@ def parameters_of_views(background: Backgrounds, n: int) -> NDArray[np.float64]:
     return np.array([(own or Background()).parameters() for own in background]).reshape(n, 5)
 
 
-def check_behind(parameters: NDArray[np.float64], vertices: NDArray[np.float64], views: Views) -> None:
+def check_behind(parameters: NDArray[np.float64], landmark: Footprint, views: Views) -> None:
     """Refuse what :meth:`Background.check_behind` refuses; each view has its own row of `parameters`, (n, 5)."""
     wall_m, floor_m = parameters[:, 0], parameters[:, 1]
-    farthest, deepest = _extremes(wall_m, vertices, views)
+    farthest, deepest = _extremes(wall_m, landmark, views)
     rounding_m = 1e-6  # files of meshes have single precision
     above = (floor_m > 0) & (deepest > floor_m + rounding_m)
     if above.any():
@@ -191,22 +189,18 @@ def check_behind(parameters: NDArray[np.float64], vertices: NDArray[np.float64],
 
 
 def _extremes(
-    wall_m: float | NDArray[np.float64], vertices: NDArray[np.float64], views: Views
+    wall_m: float | NDArray[np.float64], landmark: Footprint, views: Views
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return how far from the lens each view's landmark reaches, if it may reach the wall, and how far below it.
 
     `wall_m`, one or (n,), is 0 where there is no wall.
     """
-    nowhere = np.full(len(views), -np.inf)
-    if not len(vertices):
-        return nowhere, nowhere
-    farthest = nowhere.copy()
+    farthest, (x, y, _) = np.full(len(views), -np.inf), landmark.points.T
     # distance along the horizontal line of sight: D + x' cos δ + y' sin δ
-    reach = np.hypot(vertices[:, 0], vertices[:, 1]).max()
-    for i in np.flatnonzero((np.asarray(wall_m) > 0) & (views.distance_m + reach > wall_m)):
+    for i in np.flatnonzero((np.asarray(wall_m) > 0) & (views.distance_m + landmark.radius_m > wall_m)):
         cos, sin = math.cos(views.delta_rad[i]), math.sin(views.delta_rad[i])
-        farthest[i] = views.distance_m[i] + (vertices[:, 0] * cos + vertices[:, 1] * sin).max()
-    return farthest, -vertices[:, 2].min() - views.height_m
+        farthest[i] = views.distance_m[i] + (x * cos + y * sin).max()
+    return farthest, -landmark.lowest_m - views.height_m
 
 
 @kernel

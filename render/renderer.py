@@ -116,6 +116,7 @@ class Renderer:
         self.sensor = sensor
         self.albedo = float(albedo)
         self.topology = MeshTopology.empty() if mesh is None else topology_of(mesh)
+        self.footprint = Footprint.of_vertices(self.topology.vertices)
         self._standing: StandingLight | None = None
         self._integral = AreaIntegral(
             self.topology,
@@ -425,7 +426,7 @@ class Renderer:
         """
         self._check_lens_outside(views)
         behind = parameters_of_views(background, len(views))
-        check_behind(behind, self.topology.vertices, views)
+        check_behind(behind, self.footprint, views)
         if behind[:, BOUNCES].any():
             check_can_bounce(self.sensor)
             if not len(self.topology.faces):
@@ -520,11 +521,10 @@ class Renderer:
         inside = ((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1)
         if not inside.any():
             return
-        footprint = Footprint.of_vertices(self.topology.vertices)
-        inside &= np.hypot(lens[:, 0], lens[:, 1]) < footprint.radius_m + 1e-3
+        inside &= np.hypot(lens[:, 0], lens[:, 1]) < self.footprint.radius_m + 1e-3
         near = np.flatnonzero(inside)
         if near.size:
-            least_m = float(footprint.nearest_m(views.delta_rad[near[:1]], 1e-3)[0])
+            least_m = float(self.footprint.nearest_m(views.delta_rad[near[:1]], 1e-3)[0])
             raise UsageError(
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {least_m:.3g} at this 'delta_rad'"

@@ -296,7 +296,7 @@ class Views:
 
 @dataclass(frozen=True)
 class Footprint:
-    """Box and circle around landmarks, seen from above.
+    """Box and circle around landmarks, seen from above, and their points.
 
     Parameters
     ----------
@@ -304,17 +304,25 @@ class Footprint:
         Corners of the box, x' and y'.
     radius_m : float
         Largest distance of a point from the axis.
+    lowest_m : float
+        z' of the lowest point.
+    points : (v, 3) float64
     """
 
     low_m: NDArray[np.float64]
     high_m: NDArray[np.float64]
     radius_m: float
+    lowest_m: float
+    points: NDArray[np.float64]
 
     @classmethod
     def of_vertices(cls, vertices: NDArray[np.float64]) -> Footprint:
-        """Take the points of landmarks, (n, 3), landmark frame."""
-        across = np.asarray(vertices[:, :2], np.float64)
-        return cls(across.min(axis=0), across.max(axis=0), float(np.hypot(*across.T).max()))
+        """Take the points of landmarks, (v, 3), landmark frame."""
+        points = np.asarray(vertices, np.float64)
+        if not len(points):
+            return cls(np.zeros(2), np.zeros(2), -math.inf, math.inf, points.reshape(0, 3))
+        low, high = points.min(axis=0), points.max(axis=0)
+        return cls(low[:2], high[:2], float(np.hypot(*points[:, :2].T).max()), float(low[2]), points)
 
     def nearest_m(self, delta_rad: NDArray[np.float64], gap_m: float) -> NDArray[np.float64]:
         """Return from which D on the lens is outside of the box or of the circle, with a gap.

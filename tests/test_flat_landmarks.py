@@ -78,7 +78,7 @@ def test_the_lens_keeps_clear_of_the_box_or_of_the_circle_whichever_is_nearer():
     np.testing.assert_allclose(flat.reach_m(delta[[0, 3]]), [half, WIDE_M / 2], rtol=1e-9)
     post = Footprint.of_vertices(trimesh.creation.cylinder(0.1, 1.0, sections=256).vertices)
     np.testing.assert_allclose(post.nearest_m(np.array([0.0, 45.0]) * DEGREE, 0.0), 0.1, rtol=1e-3)
-    aside = Footprint(np.array([0.3, -0.1]), np.array([0.5, 0.1]), math.hypot(0.5, 0.1))
+    aside = Footprint(np.array([0.3, -0.1]), np.array([0.5, 0.1]), math.hypot(0.5, 0.1), 0.0, np.zeros((0, 3)))
     np.testing.assert_allclose(aside.nearest_m(np.array([0.0, 180.0]) * DEGREE, gap), [gap, 0.5 + gap], rtol=1e-9)
 
 

@@ -134,14 +134,13 @@ class FrameJob(FramesJob[FramePlan]):
             views = stated.in_camera(self.sensor)
             for k, renderer in enumerate(self._renderers):
                 of_class = np.flatnonzero(truth["class_index"] == k)
-                vertices = renderer.topology.vertices
-                reach = float(np.hypot(vertices[:, 0], vertices[:, 1]).max())
+                landmark, vertices = renderer.footprint, renderer.topology.vertices
                 lens = views.lens_in_landmark()[of_class]
                 low, high = vertices.min(axis=0) - 1e-3, vertices.max(axis=0) + 1e-3
                 inside = ((lens > low) & (lens < high)).all(axis=1)
                 # NaN (no wall, no floor) compares as false
-                before = truth["wall_m"][of_class] < views.distance_m[of_class] + reach
-                above = -truth["floor_m"][of_class] > vertices[:, 2].min() + views.height_m[of_class]
+                before = truth["wall_m"][of_class] < views.distance_m[of_class] + landmark.radius_m
+                above = -truth["floor_m"][of_class] > landmark.lowest_m + views.height_m[of_class]
                 unseen = np.zeros(len(of_class), np.bool_)
                 unseen[renderer.turned_out_of_view(stated[of_class])] = True
                 for view in of_class[inside | before | above | unseen]:
@@ -149,7 +148,7 @@ class FrameJob(FramesJob[FramePlan]):
                     try:
                         background = _background(truth["wall_m"][view], truth["floor_m"][view], self.plan)
                         if background is not None:
-                            background.check_behind(vertices, views[one])
+                            background.check_behind(landmark, views[one])
                         renderer.check_in_view(stated[one])
                         if inside[np.searchsorted(of_class, view)]:
                             raise UsageError(

@@ -270,7 +270,7 @@ class CalibrationModel:
         views = replace(views, distance_m=views.distance_m - slack_m, height_m=views.height_m + slack_m)
         for which, background in self._scenes:
             if background is not None:
-                background.check_behind(self._renderer.topology.vertices, views[which])
+                background.check_behind(self._renderer.footprint, views[which])
 
     def lens_within(self) -> _Bool:
         """Return from which poses the lens would stand in the landmark's foot print, (K,)."""
@@ -421,14 +421,13 @@ class CalibrationModel:
         Not `direct`: with the light that bounces at this mounting.
         """
         renderer = self._renderer.seen_by(mounting.on(self.sensor))
-        vertices = self._renderer.topology.vertices
         self.rendered()
 
         def seen(views: Views, background: Background | None) -> PhasorImages:
             if background is not None:
                 bounces = 0 if direct else background.bounces
                 background = replace(background, floor_albedo=mounting.floor_albedo, bounces=bounces)
-                background = background.giving_way(vertices, views.in_camera(renderer.sensor))
+                background = background.giving_way(renderer.footprint, views.in_camera(renderer.sensor))
             return renderer.render_views(views, background=background)
 
         if alone:

@@ -361,7 +361,7 @@ class LikelihoodMatcher:
         """Check that the landmarks of the bank do not reach below a floor that was stated."""
         view = Views.broadcast(float(self._bank.distance_m[-1])).in_camera(self._bank.sensor)
         for c in range(len(self._setup.rules.names)):
-            Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).topology.vertices, view)
+            Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).footprint, view)
 
     def _cells(self, behind: PhasorImages | None, *, open_edges: bool = False, tilted: bool = False) -> CellBounds:
         """Return the cells of the bank before some background, for level or for tilted frames."""

@@ -282,13 +282,15 @@ class RenderedModel(ImageModel):
 
         Floors are estimated, and heights are tried. So are sides of a landmark whose far end then reaches a wall.
         """
-        vertices, seen = self._renderers[class_index].topology.vertices, views.in_camera(self.sensor)
+        farthest_m, circle_m = views.distance_m.max(), self._footprint.radius_m
+        may_be_cut = max(farthest_m, circle_m + _BEFORE_LENS_M) + circle_m + _BEFORE_WALL_M > self._wall_m.min()
+        if not self._floors and not may_be_cut:
+            return self._backgrounds[0] if self._frame is None else self._behind(which)
         nearest, farthest = self.limits(views.delta_rad, which)
         cut = np.isfinite(self._wall_m).any() & ((nearest > farthest) | (views.distance_m > farthest))
-        if not self._floors and not cut.any():
-            return self._backgrounds[0] if self._frame is None else self._behind(which)
-        behind, least_m = self._behind(which), -(float(vertices[:, 2].min()) + seen.height_m)
+        landmark, seen = self._renderers[class_index].footprint, views.in_camera(self.sensor)
+        behind, least_m = self._behind(which), -(landmark.lowest_m + seen.height_m)
         for k, own in enumerate(behind):
             if own is not None and (cut[k] or (own.floor_m is not None and own.floor_m < least_m[k])):
-                behind[k] = own.giving_way(vertices, seen[np.array([k])])
+                behind[k] = own.giving_way(landmark, seen[np.array([k])])
         return behind
