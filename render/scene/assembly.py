@@ -125,15 +125,13 @@ class Assembly:
         """Return the vertices of all bodies, where they stand, those of the meshes of solids too, (v, 3)."""
         return np.concatenate([self._placed_shell(b)[0] for b in range(len(self._own))])
 
-    def check_outside(self, lens_m: NDArray[np.float64], names: Sequence[str], frames: NDArray[np.int64]) -> None:
+    def check_outside(self, lens_m: NDArray[np.float64], frames: NDArray[np.int64]) -> None:
         """Refuse a lens inside a closed body.
 
         Parameters
         ----------
         lens_m : (n, 3) float64
             World frame.
-        names : sequence of str
-            Of the bodies.
         frames : (n,) int64
             Their numbers, for the message.
 
@@ -145,7 +143,7 @@ class Assembly:
         for frame, lens in zip(frames, lens_m, strict=True):
             part = part_around(mesh, lens)
             if part >= 0:
-                raise _inside(int(frame), names[mesh.part[mesh.parts[part, 0]]])
+                raise _inside(int(frame), self._bodies[mesh.part[mesh.parts[part, 0]]].name)
         if all(solid is not None for solid in self._solids):
             return
         directions = np.concatenate([_WATCHED, -_WATCHED])
@@ -157,7 +155,7 @@ class Assembly:
         inside = np.flatnonzero((face >= 0) & self.topology.closed[face] & from_behind)
         if inside.size:
             k = int(inside[0])
-            raise _inside(int(frames[k // len(directions)]), names[self.topology.part[face[k]]])
+            raise _inside(int(frames[k // len(directions)]), self._bodies[self.topology.part[face[k]]].name)
 
     def _joined(self) -> MeshTopology:
         """Join the arrays that do not depend on poses, and make room for those that do."""

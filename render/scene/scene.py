@@ -45,6 +45,8 @@ class Scene:
         if not given:
             raise UsageError("a scene needs at least one body")
         self.bodies = tuple(body if body.name else body.named(f"body {k}") for k, body in enumerate(given))
+        self.names = tuple(body.name for body in self.bodies)
+        """Names of the bodies, in the order of ``shares``."""
         twice = [name for name, count in Counter(self.names).items() if count > 1]
         if twice:
             raise UsageError(f"two bodies are named '{twice[0]}': names of bodies must differ")
@@ -62,11 +64,6 @@ class Scene:
     def __getitem__(self, name: str) -> Body:
         """Return the body of a name."""
         return self.bodies[self.index(name)]
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the bodies, in the order of ``shares``."""
-        return tuple(body.name for body in self.bodies)
 
     @property
     def poses(self) -> NDArray[np.float64]:

@@ -325,7 +325,6 @@ class SceneRenderer:
         frames = [np.array(which) for which in alike.values()]
         if len(frames) > 1:
             self._assembly.let_move((placings != placings[0]).any(axis=(0, 2, 3))[self._owner])
-        names = [self.scene.names[b] for b in self._owner]
         lanes = [lane for i in range(min(workers, len(frames))) if (lane := frames[i::workers])]
         threads = max(workers // max(len(lanes), 1), 1)
 
@@ -333,7 +332,7 @@ class SceneRenderer:
             assembly = self._assembly if len(lanes) == 1 else self._assembly.copy()
             for which in lane:
                 assembly.place(composed(placings[which[0], self._owner], self._in_body))
-                assembly.check_outside(cameras[which, :3, 3], names, which)
+                assembly.check_outside(cameras[which, :3, 3], which)
                 use(assembly, which, self._poses(assembly, cameras[which], background), threads)
 
         mapped(run, lanes, len(lanes))
