@@ -413,7 +413,8 @@ def test_cylinders_and_ellipsoids_are_what_their_fine_meshes_are(axis):
     turned[:3, 3] = 1.0, 0.1, 0.05
     for body in (Body.cylinder(0.12, 0.3, pose=turned), Body.ellipsoid((0.1, 0.2, 0.15), pose=turned)):
         exact = SceneRenderer(Scene([body]), WIDE).phasors(np.eye(4))
-        facets = SceneRenderer(Scene([replace(body, primitive=None)]), WIDE).phasors(np.eye(4))
+        each = np.full(len(body.mesh.faces), body.albedo)  # an albedo of each facet
+        facets = SceneRenderer(Scene([replace(body, albedo=each)]), WIDE).phasors(np.eye(4))
         np.testing.assert_allclose(exact.phasor, facets.phasor, atol=2e-3 * np.abs(exact.phasor).max())
 
 
