@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -306,3 +307,18 @@ def test_bounces_that_cannot_be_computed_are_refused(monkeypatch: pytest.MonkeyP
         SceneRenderer(Scene([_hollow_sphere(1.0, 1.0, 2)]), sensor, bounces="all", bounce_tolerance=0.1).render(
             np.eye(4)
         )
+
+
+def test_light_bounces_off_the_union_of_joined_bodies() -> None:
+    turned = trimesh.transformations.rotation_matrix(0.4, [0, 0, 1])
+    turned[:3, 3] = 0.02, 0.05, 0.03
+    parts = [Body.box((0.3, 0.2, 0.2), albedo=0.7), Body.box((0.15, 0.4, 0.15), albedo=0.7, pose=turned)]
+    pose = trimesh.transformations.translation_matrix([1.2, 0, 0])
+    joined = replace(Body.joined(parts), pose=pose)
+    mesh = Body(trimesh.Trimesh(joined.mesh.vertices, joined.mesh.faces, process=False), 0.7, pose=pose)
+    found, expected = (
+        renderer._assembly.in_facets(renderer.scene.bodies, renderer.scene.poses).topology
+        for renderer in (SceneRenderer(Scene([body]), PMD) for body in (joined, mesh))
+    )
+    np.testing.assert_array_equal(found.vertices[found.faces], expected.vertices[expected.faces])
+    assert len(found.faces) > 24  # cut where the boxes meet

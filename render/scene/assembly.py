@@ -112,13 +112,13 @@ class Assembly:
             self._still = None
             self.intersector = self._intersectors()
 
-    def in_facets(self) -> Assembly:
-        """Return the same bodies, where they stand, as meshes."""
-        if all(solid is None for solid in self._solids):
+    def in_facets(self, whole: Sequence[Body], body2world: NDArray[np.float64]) -> Assembly:
+        """Return the bodies of which these may be parts as meshes, where they stand: parts that overlap are united."""
+        if len(whole) == len(self._bodies) and all(solid is None for solid in self._solids):
             return self
         if self._facets is None:
-            self._facets = Assembly(self._bodies, self._kind, solids=False)
-        self._facets.place(self._poses)
+            self._facets = Assembly(whole, self._kind, solids=False)
+        self._facets.place(body2world)
         return self._facets
 
     def corners(self) -> NDArray[np.float64]:

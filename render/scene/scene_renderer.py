@@ -188,7 +188,7 @@ class SceneRenderer:
         UsageError
             No body has that name, or as for :meth:`render`.
         """
-        free = self._owner == self.scene.index(name)
+        free = np.arange(len(self.scene)) == self.scene.index(name)
         return [self._images(sums) for sums in self._sums(camera2world, bodies2world, None, workers, free)]
 
     def _images(self, sums: Sums) -> PhasorImages:
@@ -208,7 +208,7 @@ class SceneRenderer:
         workers: int,
         free: NDArray[np.bool_] | None = None,
     ) -> list[Sums]:
-        """Return the sums of all pixels, or those of each power of the albedo of pieces that are free."""
+        """Return the sums of all pixels, or those of each power of the albedo of bodies that are free, (b,)."""
         cameras = rigid_transforms(camera2world, "camera2world")
         n, b = self._counts(cameras)
         if self.bounces and background is not None:
@@ -219,10 +219,12 @@ class SceneRenderer:
         columns_hz = phasor_frequencies_hz(self.sensor.frequencies_hz, self._harmonics)
         powers = [no_light(shape, len(columns_hz), b) for _ in range(1 if free is None else 2)]
         bounced: list[tuple[NDArray[np.int64], NDArray[np.complex128]]] = []
+        placings = self.scene.posed(bodies2world, n)
+        free_pieces = None if free is None else free[self._owner]
 
         def integrate(assembly: Assembly, which: NDArray[np.int64], poses: Poses, threads: int) -> None:
             pixels = (which[:, None] * shape[1] * shape[2] + np.arange(shape[1] * shape[2])).ravel()
-            for sums, topology in zip(powers, _by_power(assembly.topology, free), strict=True):
+            for sums, topology in zip(powers, _by_power(assembly.topology, free_pieces), strict=True):
                 integral = AreaIntegral(
                     topology, assembly.intersector, self.sensor, harmonics=self._harmonics, rays=self._rays
                 )
@@ -231,9 +233,10 @@ class SceneRenderer:
                     own[pixels] = new
                 sums.state[which] = found.state
             if self.bounces:
-                bounced.append((pixels, self._bounced(assembly, poses, [0.0, *columns_hz], free)))
+                mesh = assembly.in_facets(self.scene.bodies, placings[which[0]])
+                bounced.append((pixels, self._bounced(mesh, poses, [0.0, *columns_hz], free)))
 
-        self._for_each_placing(integrate, cameras, bodies2world, background, workers)
+        self._for_each_placing(integrate, cameras, placings, background, workers)
         self.untrusted_pixels += int((powers[0].state == UNTRUSTED).sum())
         for pixels, light in bounced:
             for k in range(light.shape[2]):
@@ -245,10 +248,9 @@ class SceneRenderer:
         return powers
 
     def _bounced(
-        self, assembly: Assembly, poses: Poses, frequencies_hz: Sequence[float], free: NDArray[np.bool_] | None
+        self, mesh: Assembly, poses: Poses, frequencies_hz: Sequence[float], free: NDArray[np.bool_] | None
     ) -> NDArray[np.complex128]:
         """Return the light that has bounced, (pixels of all poses, frequencies, powers)."""
-        mesh = assembly.in_facets()
         if not light_bounces(mesh.topology):
             return np.zeros(
                 (len(poses.lens) * self.sensor.rows * self.sensor.cols, len(frequencies_hz), 1), np.complex128
@@ -285,7 +287,7 @@ class SceneRenderer:
 
             mapped(run, range(len(which)), threads)
 
-        self._for_each_placing(count, cameras, bodies2world, background, workers)
+        self._for_each_placing(count, cameras, self.scene.posed(bodies2world, n), background, workers)
         shape = n, sensor.rows, sensor.cols
         return HistogramImages(
             detected_counts(signal, sensor).reshape(*shape, -1),
@@ -310,7 +312,7 @@ class SceneRenderer:
         self,
         use: Callable[[Assembly, NDArray[np.int64], Poses, int], None],
         cameras: NDArray[np.float64],
-        bodies2world: ArrayLike | dict[str, ArrayLike] | None,
+        placings: NDArray[np.float64],
         background: Background | None,
         workers: int,
     ) -> None:
@@ -318,7 +320,6 @@ class SceneRenderer:
         if workers < 1:
             raise UsageError(f"'workers' must be at least 1, got {workers!r}")
         n = len(cameras)
-        placings = self.scene.posed(bodies2world, n)
         alike: dict[bytes, list[int]] = {}
         for k in range(n):
             alike.setdefault(placings[k].tobytes(), []).append(k)
