@@ -27,11 +27,11 @@ _FOLDERS = {
         "bin_counts expected_targets fit_model footprints photon_counts sample_counts targets transients"
     ),
     "render/exposure": "capture photoelectrons random_streams taps",
-    "render/scene": "assembly crossings depth_slopes",
+    "render/scene": "assembly depth_slopes",
     "render/integral": (
-        "arguments bent_edges borders circular components convex_parts edge_motion edge_projection edges_in_pixels"
-        " face_search floor_phase gloss image_rays intersect intervals light limbs mesh_topology pixel_splitting"
-        " quadrature_rules ray_plan round_edges scene_samples strips swept_light visible_faces"
+        "arguments bent_edges borders circular components convex_parts crossings edge_motion edge_projection"
+        " edges_in_pixels face_search floor_phase gloss image_rays intersect intervals light limbs mesh_topology"
+        " pixel_splitting quadrature_rules ray_plan round_edges scene_samples strips swept_light visible_faces"
     ),
 }
 COMPILED_SOURCES = tuple(f"{folder}/{name}.py" for folder, names in _FOLDERS.items() for name in names.split())

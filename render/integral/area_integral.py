@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render.integral.arguments import Camera, Light, Motion, Poses, Samples, Sums
 from phasemark.render.integral.buffers import Buffers, Layout, lend_buffers, room_for_samples
+from phasemark.render.integral.crossings import cut_where_it_crosses_itself
 from phasemark.render.integral.gloss import count_highlight_boxes
 from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.intersect import Intersector
@@ -317,7 +318,7 @@ def topology_of(mesh: SurfaceMesh) -> MeshTopology:
         wrong = faces[(faces < 0) | (faces >= n)]
         if wrong.size:
             raise UsageError(f"a face of the mesh names vertex {wrong[0]}, but there are {n}, counted from 0")
-        found = MeshTopology.from_mesh(unite_shells(mesh))
+        found = cut_where_it_crosses_itself(MeshTopology.from_mesh(unite_shells(mesh)))
         _TOPOLOGIES[key] = found
         most_topologies = 16
         if len(_TOPOLOGIES) > most_topologies:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.render.integral.area_integral import mesh_digest
 from phasemark.render.integral.convex_parts import enter_parts, part_around
+from phasemark.render.integral.crossings import crossings, cut_where_it_crosses_itself, move_onto, with_creases
 from phasemark.render.integral.face_search import FaceGrid
 from phasemark.render.integral.gloss import gloss_row
 from phasemark.render.integral.intersect import Intersector, make_intersector
@@ -24,7 +25,6 @@ from phasemark.render.integral.mesh_topology import CREASE_RAD, MeshTopology, al
 from phasemark.render.integral.shells import unite_shells
 from phasemark.render.rigid import product
 from phasemark.render.scene.body import Body, Surface
-from phasemark.render.scene.crossings import crossings, cut_where_it_crosses_itself, move_onto, with_creases
 from phasemark.render.scene.solids import Solid
 
 _RIGID = 4e-6

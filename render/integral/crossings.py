@@ -1,4 +1,4 @@
-"""Curves along which the faces of two bodies pass through one another: edges of a scene like any other."""
+"""Curves along which faces pass through one another, of two bodies or of one mesh: edges like any other."""
 
 from __future__ import annotations
 
