@@ -126,6 +126,20 @@ def test_nothing_above_the_threshold_is_no_target() -> None:
     assert np.isnan(found.distance_m).all()
 
 
+@pytest.mark.parametrize("more", [-4.0, 0.0, 4.0])
+def test_a_bin_whose_neighbours_are_too_dark_to_place_it_is_no_target(more: float) -> None:
+    """The counts above ambient add up to −4, 0 and 4: their centroid is at bin 41, at infinity and at bin 26."""
+    counts = np.full(128, 10.0)
+    counts[30:34] = 30.0, 0.0, 0.0, 10.0 + more
+    counts[100] = 60.0
+    sensor = one_zone(max_targets=4, estimator="centroid", estimator_bins=3, threshold=5.0)
+    found = find_targets(HistogramFrames(counts[None, None, None, None], sensor=sensor))
+    valid = found.status.ravel() == Status.VALID
+    np.testing.assert_allclose(found.distance_m.ravel()[valid], 100.5 * WIDTH_M)
+    assert np.isnan(found.sigma_m.ravel()[~valid]).all()
+    assert (found.signal.ravel()[~valid] == 0).all()
+
+
 def test_z_is_the_range_times_the_cosine_of_the_zone() -> None:
     wide = {"half_angle_h_deg": 30, "half_angle_v_deg": 30, "cols": 2}
     mean = np.repeat(gaussian_counts([50.0], 1e4, 5.0)[None], 2, axis=0)[None]

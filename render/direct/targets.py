@@ -56,7 +56,8 @@ def find_targets(frames: Counted) -> Targets:
 
     The ambient level is the median bin. Peaks are local maxima that rise above it by `threshold` standard deviations
     of a bin; the highest come first, others at least `min_separation_m` away follow, up to `max_targets`. A peak is
-    placed between bins by the centroid of its counts above ambient or by the parabola through its three highest bins.
+    placed between bins by the centroid of its counts above ambient or by the parabola through its three highest bins. A
+    peak whose centroid lies outside of the bins that it is taken over is none.
 
     Parameters
     ----------
@@ -150,10 +151,12 @@ def _find_peaks(counts, centroid, reach, threshold, separation, place, sigma, si
         level = _median(row, scratch)  # peaks take fewer than half of the bins
         least = level + threshold * math.sqrt(max(level, 1.0))
         found = 0
+        for j in range(n_bins):
+            scratch[j] = 0.0  # 1 where a peak was passed over
         while found < most:
             best, height = -1, least
             for j in range(1, n_bins - 1):
-                if row[j] <= height or row[j] < row[j - 1] or row[j] < row[j + 1]:
+                if row[j] <= height or row[j] < row[j - 1] or row[j] < row[j + 1] or scratch[j] > 0:
                     continue
                 apart = True
                 for k in range(found):
@@ -168,6 +171,9 @@ def _find_peaks(counts, centroid, reach, threshold, separation, place, sigma, si
                 for j in range(low, high):
                     total += row[j] - level
                     x += (row[j] - level) * (j + 0.5)
+                if not low * total < x < high * total:  # dark bins beside it leave no counts that could be placed
+                    scratch[best] = 1.0
+                    continue
                 x /= total
                 for j in range(low, high):
                     variance += row[j] * (j + 0.5 - x) ** 2
