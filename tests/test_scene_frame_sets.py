@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import importlib
 import json
 import math
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +27,7 @@ from phasemark.data.files import write_checksum
 from phasemark.data.frames import FrameSet
 from phasemark.data.partial_outputs import build_part, estimate_build, merge_parts
 from phasemark.data.plans import SceneFramesPlan, planned_size
+from phasemark.data.plans.generated_scene import imported_generator
 from phasemark.data.seeds import stream
 from phasemark.data.verify import verify_frames
 from phasemark.matcher.plan_kinds import check_plan, plan_example
@@ -319,6 +323,32 @@ def test_a_generator_that_is_wrong_is_named_with_its_scene(
         build_frames(plan_of(generator, 4, scenes=about), tmp_path / "bad.h5", workers=1, shard_items=1)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "bad.h5").exists()
+
+
+def test_a_generator_is_what_its_function_and_the_module_that_names_it_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    texts = {
+        "makes_it": "import functools\ndef made(index, rng, far=1): ...\npart = functools.partial(made, far=2)\n",
+        "names_it": "from makes_it import made\nimport functools\nother = functools.partial(made, far=3)\n",
+    }
+
+    def hashes() -> list[str]:
+        for name, text in texts.items():
+            (tmp_path / f"{name}.py").write_text(text)
+            monkeypatch.delitem(sys.modules, name, raising=False)
+        importlib.invalidate_caches()
+        return [imported_generator(text)[1] for text in ("makes_it:made", "makes_it:part", "names_it:other")]
+
+    first = hashes()
+    assert first[0] == first[1] == hashlib.sha256((tmp_path / "makes_it.py").read_bytes()).hexdigest()
+    texts["names_it"] += "# changed\n"
+    second = hashes()
+    assert [old == new for old, new in zip(first, second, strict=True)] == [True, True, False]
+    texts["makes_it"] += "# changed\n"
+    assert not set(hashes()) & {*first, *second}
 
 
 def test_the_traceback_of_a_generator_begins_in_its_own_code() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import inspect
 import math
@@ -11,6 +12,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -110,7 +112,10 @@ def class_of_body(name: str, classes: Sequence[str]) -> int | None:
 
 
 def imported_generator(text: str) -> tuple[Generator, str]:
-    """Return the generator that ``module:function`` names, and the SHA-256 of its module's source.
+    """Return the generator that ``module:function`` names, and a SHA-256 of what it is made of.
+
+    That is the source of the module it is named in, and of the one that defines it where that is another: of a
+    :class:`functools.partial` the module of its function.
 
     Raises
     ------
@@ -118,12 +123,22 @@ def imported_generator(text: str) -> tuple[Generator, str]:
         It cannot be imported.
     """
     found: Generator = imported_program(text, "the generator")
-    module = sys.modules.get(getattr(found, "__module__", None) or text.partition(":")[0])
+    defined: Any = found
+    while isinstance(defined, functools.partial):
+        defined = defined.func
+    modules = dict.fromkeys((text.partition(":")[0], getattr(defined, "__module__", None)))
+    sources = [_source_of(sys.modules.get(name)) for name in modules if name]
+    if len(sources) == 1:
+        return found, hashlib.sha256(sources[0]).hexdigest()
+    return found, hashlib.sha256(b"".join(hashlib.sha256(source).digest() for source in sources)).hexdigest()
+
+
+def _source_of(module: ModuleType | None) -> bytes:
+    """Return the source of a module; nothing of one that is compiled, or was typed at a prompt."""
     try:
-        source = Path(inspect.getsourcefile(module) or "").read_bytes() if module is not None else b""
-    except (OSError, TypeError):  # compiled, or typed at a prompt
-        source = b""
-    return found, hashlib.sha256(source).hexdigest()
+        return Path(inspect.getsourcefile(module) or "").read_bytes() if module is not None else b""
+    except (OSError, TypeError):
+        return b""
 
 
 def generated(
