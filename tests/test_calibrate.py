@@ -1062,6 +1062,41 @@ def test_a_mistake_with_a_recording_is_named(kind):
     assert math.isnan(trusted)
 
 
+@pytest.mark.parametrize(
+    ("kind", "part"),
+    [
+        ("radians", "recording 2 differs from what"), ("x", "of recording 2, x of the poses"),
+        ("stamps", "recording 2: the frames have no time stamps"),
+        ("twice", "recordings 1 and 2 have 40 frames in common"),
+    ],
+)  # fmt: skip
+def test_the_one_of_several_recordings_that_is_wrong_is_named(kind, part):
+    rng = np.random.default_rng(3)
+    truth = carelessly_mounted(rng, 1.0, 0.01, 5e-3)
+    frames, poses, zones = [], [], None
+    for _ in range(3):
+        one, known, zones = record(rng, truth, zone=zones)
+        frames.append(one)
+        poses.append(known)
+    heading = poses[1].delta_rad - poses[1].bearing_rad
+    x, y = (-poses[1].distance_m * turn(poses[1].delta_rad) for turn in (np.cos, np.sin))
+    if kind in ("radians", "x"):
+        x, heading = (-x, heading) if kind == "x" else (x, DEGREE * heading)
+        poses[1] = replace(KnownPoses.cartesian(x, y, heading), time_s=poses[1].time_s)
+    if kind == "stamps":
+        frames[1] = replace(frames[1], time_s=None)
+    if kind == "twice":
+        frames[1], poses[1] = frames[0], poses[0]
+    try:
+        found = calibrate(BOARD, frames, poses, free=FREE, moving=True)
+    except UsageError as error:
+        said = str(error)
+    else:
+        assert found.doubts
+        said = f"{'; '.join(found.doubts)}: {found.cause}"
+    assert part in said
+
+
 @pytest.mark.soak
 def test_95_of_100_mistakes_with_recordings_are_named_or_mended():
     mended = stats.chi2.ppf(0.9999, len(FREE))

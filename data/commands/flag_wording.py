@@ -20,6 +20,7 @@ FLAGS = {
 """Parameters that messages name, as ``name=value``, ``name=True`` or ``name=…``, and their flags."""
 PHRASES = {
     "Mounting(delay_s=…)": "--delay-ms",
+    "landmark_yaw_rad=…": "--landmark-yaw",
     "bounces and a positive floor_albedo_std of the background": "--bounces, without --floor-albedo",
     "layout='full'": "--full, layout = 'full'",
     "pose_times_s(delay_s=…)": "match --delay-ms",

@@ -7,6 +7,7 @@ its covariance, a test of the fit, and sentences on numbers that these poses can
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,6 +29,7 @@ from phasemark.matcher.calibration.still_fit import solve_still
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.likelihood.residuals import ResidualKind
 from phasemark.matcher.one_frequency import OneFrequency
+from phasemark.matcher.pixel_agreement import MIN_RETURNS
 from phasemark.render import Background, Sensor
 
 
@@ -155,6 +157,7 @@ def calibrate(
     )
     if others and names == ("delay",):
         raise UsageError("each recording has a delay of its own: with free=delay give one recording at a time")
+    _refuse_twice([own for own, _ in (first, *others)])
     each = [problem_of(own if one is None else one.frames(own), known) for own, known in (first, *others)]
     problem = replace(each[0], others=tuple(each[1:]))
     try:
@@ -180,6 +183,15 @@ def _recordings(
         if one.sensor != measured[0].sensor:
             raise UsageError(f"recording {k} is of another sensor than the first")
     return [(own, _tilted(poses, own, moving)) for own, poses in zip(measured, known, strict=True)]
+
+
+def _refuse_twice(recordings: Sequence[FilteredFrames]) -> None:
+    """Refuse recordings that share frames: their errors are not independent."""
+    chance = 0.1  # share of the frames of the shorter one that may be equal by chance
+    each = [{own.tobytes() for own in one.range_m if np.isfinite(own).sum() >= MIN_RETURNS} for one in recordings]
+    for (j, one), (k, other) in itertools.combinations(enumerate(each, 1), 2):
+        if len(one & other) > chance * min(len(one), len(other)):
+            raise UsageError(f"recordings {j} and {k} have {len(one & other)} frames in common: give each frame once")
 
 
 def _tilted(poses: KnownPoses, frames: FilteredFrames, moving: bool) -> KnownPoses:

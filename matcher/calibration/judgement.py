@@ -16,12 +16,15 @@ from phasemark import UsageError
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, clipped, prior_std
 from phasemark.matcher.calibration.mounting_model import natural_units
 from phasemark.matcher.calibration.problem import Problem, Solution
+from phasemark.matcher.calibration.recording_effects import TURN, own_text
 from phasemark.matcher.calibration.recording_fit import RecordingFit
 from phasemark.render.frames import MOST_TILT_DEG
 
 _Change = Callable[[Problem], Problem]
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""
+_MOST_FRAMES_OUT = 0.15
+"""Share of the frames of a recording of which most pixels may disagree."""
 _DELAY_NOTED_S, _DELAY_GAIN = 0.015, 0.8
 """A stated delay is doubted if one farther away lowers the mean square residual to that share."""
 _BETTER = 0.5
@@ -31,6 +34,15 @@ _FITS_M = 0.02
 _AS, _QUANTITY = "taken as ", "the numbers are likely {right}: give quantity={right}"
 _CLOCKS = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: are both in one clock? state the delay"
 _HALVES = "first", "second"
+_MOST_APART = {
+    "range_offset": 0.025, **dict.fromkeys(("bearing", "pitch", "roll"), math.radians(5.0)), "delay": 0.6,
+    TURN: math.radians(8.0),
+}  # fmt: skip
+"""By how much one of several recordings may differ from what they share, metres, radians, seconds: six times the usual
+and more, and three times the usual of a delay."""
+
+
+_EXPECTED = "is known of the camera and the poses"
 
 
 def doubts_about(solution: Solution) -> tuple[str, ...]:
@@ -56,9 +68,11 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
     most_left_out = 0.5  # share of the pixels on the landmark that may disagree with the model
     if solution.left_out > most_left_out:
         doubts.append(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
-    most_frames_out = 0.15  # share of the frames of which most pixels may disagree
-    if solution.frames_left_out > most_frames_out:
-        doubts.append(f"most pixels of {100 * solution.frames_left_out:.0f} % of the frames disagree with their poses")
+    out = solution.frames_left_out
+    for k, share in enumerate(out, 1):
+        if share > _MOST_FRAMES_OUT:
+            whose = f" of recording {k}" if len(out) > 1 else ""
+            doubts.append(f"most pixels of {100 * share:.0f} % of the frames{whose} disagree with their poses")
     no_model = 20.0  # χ² a degree of freedom beyond which a covariance that is scaled by it means nothing
     if solution.chi2 > no_model * solution.dof:
         doubts.append(f"χ² is {solution.chi2 / solution.dof:.3g} times what noise leaves")
@@ -79,6 +93,11 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
         if std > unknown_s:
             which = f"recording {k}" if len(delays) > 1 else "this recording"
             doubts.append(f"the delay cannot be determined from {which} (± {1e3 * std:.0f} ms)")
+    for k, own in enumerate(solution.own, 1):
+        apart = [own_text(name, value) for name, (value, _) in own.items() if abs(value) > _MOST_APART[name]]
+        if apart:
+            which = f"recording {k}" if problem.others else "this recording"
+            doubts.append(f"{which} differs from what {_EXPECTED} by {', '.join(apart)}")
     wander_m, wander_rad = 0.02, math.radians(3.0)
     distance, delta = (math.sqrt(float((solution.pose_shift[:, k] ** 2).mean())) for k in (0, 1))
     if distance > wander_m or delta > wander_rad:
@@ -127,7 +146,7 @@ def _doubt_of_quantity(solution: Solution) -> list[str]:
 def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
     """Return the likely cause of doubts: the change of a stated value that fits best, if it fits much better."""
     stated = _asked(solution.problem)
-    cause = _better(stated, solution.edges)
+    cause = _cause(stated, solution.edges, _suspects(solution))
     if cause:
         return cause
     for doubt in doubts:
@@ -137,6 +156,16 @@ def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
     if len(doubts) == 1 and doubts[0].startswith(f"the {PARAMETERS['delay'].title} ran to"):
         delay_s = float(solution.theta[ALL_NAMES.index("delay")])
         return _CLOCKS.format(delay_ms=1e3 * delay_s)
+    if len(doubts) == 1 and _EXPECTED in doubts[0]:
+        own = solution.own[_suspects(solution)[0]]
+        apart = [name for name, (value, _) in own.items() if abs(value) > _MOST_APART[name]]
+        if apart == ["delay"]:
+            return _CLOCKS.format(delay_ms=1e3 * own["delay"][0])
+        if apart == [TURN]:
+            return (
+                "the landmark is turned against the axes of these poses, or their y has the other sign: state its"
+                " heading by landmark_yaw_rad=…"
+            )
     if len(doubts) == 1 and "delay cannot be determined" in doubts[0]:
         return (
             "the camera hardly moves: turn and approach faster, or state the delay with Mounting(delay_s=…) and give"
@@ -150,8 +179,30 @@ def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
 
 def cause_of_refusal(problem: Problem) -> str:
     """Return the likely cause of frames that do not fit at all, or nothing: as a part of a sentence."""
-    cause = _better(_asked(problem), None)
+    cause = _cause(_asked(problem), None, range(len(problem.recordings)))
     return f"; likely cause: {cause}" if cause else ""
+
+
+def _suspects(solution: Solution) -> Sequence[int]:
+    """Return which recordings differ much from the others, or have frames that disagree; all if none does."""
+    apart = {
+        k
+        for k, own in enumerate(solution.own)
+        if any(abs(value) > _MOST_APART[name] for name, (value, _) in own.items())
+    }
+    apart |= {k for k, share in enumerate(solution.frames_left_out) if share > _MOST_FRAMES_OUT}
+    return sorted(apart) or range(len(solution.problem.recordings))
+
+
+def _cause(stated: Problem, edges: bool | None, suspects: Sequence[int]) -> str:
+    """Return the change that fits best: of several recordings of one that is suspect, and otherwise of all."""
+    recordings = stated.recordings
+    if len(recordings) > 1:
+        each = {k: _better(recordings[k], edges) for k in suspects}
+        alike = len(each) == len(recordings) and len(set(each.values())) == 1
+        if any(each.values()) and not alike:
+            return "; ".join(f"of recording {k + 1}, {cause}" for k, cause in each.items() if cause)
+    return _better(stated, edges)
 
 
 def _better(stated: Problem, edges: bool | None) -> str:

@@ -211,8 +211,9 @@ class Solution(Fitted):
         Which pixels count.
     edges : bool
         Whether pixels that see the landmark in part may count.
-    frames_left_out : float
-        Share of the frames of which more than half of the pixels that see the landmark have no weight.
+    frames_left_out : tuple of float
+        Of each recording, share of the frames of which more than half of the pixels that see the landmark have no
+        weight.
     sensor_fields : mapping of str to value
         Fields of the sensor that were estimated beside the mounting.
     tilt_std_rad : (2,) float64
@@ -223,7 +224,7 @@ class Solution(Fitted):
     theta: NDArray[np.float64]
     use: NDArray[np.bool_]
     edges: bool
-    frames_left_out: float = 0.0
+    frames_left_out: tuple[float, ...] = ()
     sensor_fields: Mapping[str, object] = field(default_factory=dict)
     tilt_std_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
 

@@ -145,3 +145,9 @@ def own_title(name: str) -> tuple[str, float, str]:
         return "turn of the landmark", math.degrees(1), "°"
     one = PARAMETERS[name]
     return one.title, one.shown, one.unit
+
+
+def own_text(name: str, value: float) -> str:
+    """Return a recording's own number for people: its title and value with its unit."""
+    title, shown, unit = own_title(name)
+    return f"{value * shown:+.3g}{'' if unit == '°' else ' '}{unit} of {title}"

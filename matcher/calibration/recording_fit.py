@@ -20,6 +20,8 @@ within a few standard deviations: a floor, a wall or an edge does not enter.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -79,12 +81,13 @@ def solve_recording(problem: Problem) -> Solution:
     else:
         check_poses(problem)
     fit = RecordingFit(problem)
-    for recorded in fit.recorded:
+    for k, recorded in enumerate(fit.recorded, 1):
         if not problem.moving:
             check_view(recorded.model, recorded.evidence, problem.assumed)
         images = recorded.model.images(fit.assumed)
         where = recorded.candidates(images, edges=fit.edges)
-        check_ranges(recorded.model, recorded.evidence, np.where(where, recorded.residual(images), np.nan))
+        with _named(k, len(fit.recorded)):
+            check_ranges(recorded.model, recorded.evidence, np.where(where, recorded.residual(images), np.nan))
     solution = fit.solve(fit.approach())
     if "delay" in fit.own:
         notes.append(
@@ -102,10 +105,22 @@ def solve_recording(problem: Problem) -> Solution:
 def _by_time(problem: Problem) -> tuple[Problem, list[str]]:
     """Return the problem with poses by time, and notes on what was left out, of several recordings by their number."""
     recordings = problem.recordings
-    found = [one.by_time(MOST_FRAMES // len(recordings)) for one in recordings]
+    found = []
+    for k, one in enumerate(recordings, 1):
+        with _named(k, len(recordings)):
+            found.append(one.by_time(MOST_FRAMES // len(recordings)))
     several = len(found) > 1
     notes = [f"Recording {k}: {note}" if several else note for k, (_, own) in enumerate(found, 1) for note in own]
     return replace(found[0][0], others=tuple(one for one, _ in found[1:])), notes
+
+
+@contextmanager
+def _named(k: int, recordings: int) -> Iterator[None]:
+    """Name the recording of which the block refuses something, if there are several."""
+    try:
+        yield
+    except UsageError as error:
+        raise (UsageError(f"recording {k}: {error}") if recordings > 1 else error) from None
 
 
 class Place(NamedTuple):
@@ -500,7 +515,8 @@ class RecordingFit:
         left_out = 1 - float((use & seen).sum()) / max(int(seen.sum()), 1)
         few = 3  # pixels of a frame that tell nothing of it
         shown = seen.sum(axis=1)
-        frames_out = (use & seen).sum(axis=1)[shown > few] < shown[shown > few] / 2
+        frames_out = np.where(shown > few, (use & seen).sum(axis=1) < shown / 2, np.nan)
+        out_of = [frames_out[(self.recording == r) & (shown > few)] for r in range(len(self.recorded))]
         dof, systematic, p = int(use.sum()) - len(self.free), np.sqrt(sizes.variance), len(self.free)
         return Solution(
             problem=self.problem,
@@ -521,7 +537,7 @@ class RecordingFit:
             edges=self.edges,
             notes=tuple(sentences.recording_notes(use, left_out, systematic, in_file=self.zones)),
             left_out=left_out,
-            frames_left_out=float(frames_out.mean()) if frames_out.size else 0.0,
+            frames_left_out=tuple(float(one.mean()) if one.size else 0.0 for one in out_of),
             own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),
             tilt_std_rad=np.append(systematic, [0.0, 0.0])[len(LEVEL_EFFECTS) :][:2],
             sensor_fields=self._sensor_fields(
