@@ -54,8 +54,9 @@ class Renderer:
     Parameters
     ----------
     mesh : trimesh.Trimesh or None
-        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes, and those that pass
-        through themselves, are rendered two-sided, closed shells that run through one another as their union. None: no landmark, only what stands behind it.
+        The landmark, metres, landmark frame (PHYSICS section 1). Open or inverted meshes, and those that pass through
+        themselves, are rendered two-sided, closed shells that run through one another as their union. None: no
+        landmark, only what stands behind it.
     sensor : Sensor
         The camera.
     albedo : float

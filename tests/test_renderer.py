@@ -693,9 +693,9 @@ def dented_through():
 
 @pytest.mark.parametrize("mesh", [crossed_sheets(), dented_through()], ids=["open", "closed"])
 def test_a_mesh_that_passes_through_itself_agrees_with_finer_pixels(mesh):
-    fine, view = 64, {"distance_m": 1.0, "delta_rad": 0.35, "bearing_rad": 0.01, "height_m": 0.02}
-    image = Renderer(mesh, PMD).render(**view)
-    rays = Renderer(mesh, PMD.with_(rows=16 * fine, cols=16 * fine)).render(**view, variant="hard")
+    fine, view = 64, (1.0, 0.35, 0.01, 0.02)
+    image = Renderer(mesh, PMD).render(*view)
+    rays = Renderer(mesh, PMD.with_(rows=16 * fine, cols=16 * fine)).render(*view, variant="hard")
     averaged, covered = (
         values[0].reshape(16, fine, 16, fine).mean(axis=(1, 3)) for values in (rays.phasor, rays.coverage)
     )
@@ -703,7 +703,7 @@ def test_a_mesh_that_passes_through_itself_agrees_with_finer_pixels(mesh):
     assert np.abs(image.phasor[0] - averaged).max() < 1e-2 * np.abs(averaged).max()
     assert np.abs(image.coverage[0] - covered).max() < 3e-2
     slopes = Renderer(mesh, PMD).render_with_slopes(image.views, ("distance_m", "delta_rad"))[1]
-    steps = Renderer(mesh, PMD).jacobian(**view, parameters=("distance_m", "delta_rad"))
+    steps = Renderer(mesh, PMD).jacobian(*view, parameters=("distance_m", "delta_rad"))
     assert np.abs(slopes - steps).max() < 1e-3 * np.abs(steps).max()
 
 

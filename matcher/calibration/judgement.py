@@ -35,13 +35,11 @@ _AS, _QUANTITY = "taken as ", "the numbers are likely {right}: give quantity={ri
 _CLOCKS = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: are both in one clock? state the delay"
 _HALVES = "first", "second"
 _MOST_APART = {
-    "range_offset": 0.025, **dict.fromkeys(("bearing", "pitch", "roll"), math.radians(5.0)), "delay": 0.6,
+    "range_offset": 0.025, **dict.fromkeys(("bearing", "pitch", "roll"), math.radians(5.0)), "delay": 1.0,
     TURN: math.radians(8.0),
 }  # fmt: skip
 """By how much one of several recordings may differ from what they share, metres, radians, seconds: six times the usual
-and more, and three times the usual of a delay."""
-
-
+and more. A delay is found up to a second."""
 _EXPECTED = "is known of the camera and the poses"
 
 
