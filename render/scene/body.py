@@ -203,7 +203,7 @@ class Body:
         return own.solid if own.is_of(self.mesh) else None
 
     def pieces(self) -> list[Body]:
-        """Return what is rendered in place of the body: its parts, each where it stands in the body, or the body."""
+        """Return the bodies that are rendered in its place: its parts, each where it stands in the body, or itself."""
         vertices, faces = _put_together(self.parts)
         if not (np.array_equal(self.mesh.vertices, vertices) and np.array_equal(self.mesh.faces, faces)):
             return [replace(self, pose=np.eye(4))]

@@ -196,7 +196,7 @@ class SceneRenderer:
         return replace(images, shares=self._of_bodies(sums.shares, sums.state.shape), bodies=self.scene.names)
 
     def _of_bodies(self, shares: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
-        """Return what bodies fill of pixels, (*shape, b), from what their pieces fill."""
+        """Return the shares of pixels of bodies, (*shape, b), from those of their pieces."""
         first = np.searchsorted(self._owner, np.arange(len(self.scene)))
         return np.minimum(np.add.reduceat(shares.reshape(*shape, -1), first, axis=-1), 1.0)
 
