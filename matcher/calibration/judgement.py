@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -92,8 +92,7 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
             which = f"recording {k}" if len(delays) > 1 else "this recording"
             doubts.append(f"the delay cannot be determined from {which} (± {1e3 * std:.0f} ms)")
     for k, own in enumerate(solution.own, 1):
-        apart = [own_text(name, value) for name, (value, _) in own.items() if abs(value) > _MOST_APART[name]]
-        if apart:
+        if apart := [own_text(name, own[name][0]) for name in _apart(own)]:
             which = f"recording {k}" if problem.others else "this recording"
             doubts.append(f"{which} differs from what {_EXPECTED} by {', '.join(apart)}")
     wander_m, wander_rad = 0.02, math.radians(3.0)
@@ -156,7 +155,7 @@ def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
         return _CLOCKS.format(delay_ms=1e3 * delay_s)
     if len(doubts) == 1 and _EXPECTED in doubts[0]:
         own = solution.own[_suspects(solution)[0]]
-        apart = [name for name, (value, _) in own.items() if abs(value) > _MOST_APART[name]]
+        apart = _apart(own)
         if apart == ["delay"]:
             return _CLOCKS.format(delay_ms=1e3 * own["delay"][0])
         if apart == [TURN]:
@@ -181,13 +180,14 @@ def cause_of_refusal(problem: Problem) -> str:
     return f"; likely cause: {cause}" if cause else ""
 
 
+def _apart(own: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Return which of a recording's own numbers, with their standard deviations, differ too much."""
+    return [name for name, (value, _) in own.items() if abs(value) > _MOST_APART[name]]
+
+
 def _suspects(solution: Solution) -> Sequence[int]:
     """Return which recordings differ much from the others, or have frames that disagree; all if none does."""
-    apart = {
-        k
-        for k, own in enumerate(solution.own)
-        if any(abs(value) > _MOST_APART[name] for name, (value, _) in own.items())
-    }
+    apart = {k for k, own in enumerate(solution.own) if _apart(own)}
     apart |= {k for k, share in enumerate(solution.frames_left_out) if share > _MOST_FRAMES_OUT}
     return sorted(apart) or range(len(solution.problem.recordings))
 

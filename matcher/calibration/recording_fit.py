@@ -515,7 +515,7 @@ class RecordingFit:
         left_out = 1 - float((use & seen).sum()) / max(int(seen.sum()), 1)
         few = 3  # pixels of a frame that tell nothing of it
         shown = seen.sum(axis=1)
-        frames_out = np.where(shown > few, (use & seen).sum(axis=1) < shown / 2, np.nan)
+        frames_out = (use & seen).sum(axis=1) < shown / 2
         out_of = [frames_out[(self.recording == r) & (shown > few)] for r in range(len(self.recorded))]
         dof, systematic, p = int(use.sum()) - len(self.free), np.sqrt(sizes.variance), len(self.free)
         return Solution(
