@@ -21,6 +21,7 @@ from phasemark.render.bounces import bounced_light
 from phasemark.render.bounces.form_factors import triangle_form_factors
 from phasemark.render.bounces.patches import Patches, make_patches
 from phasemark.render.bounces.transport import Transport, transport_between
+from phasemark.render.scene import scene_renderer
 from phasemark.render.scene.assembly import Assembly
 from phasemark.render.sensor.sensor import Sensor
 from phasemark.render.sensor.sensor_quantities import SPEED_OF_LIGHT_M_S
@@ -309,16 +310,23 @@ def test_bounces_that_cannot_be_computed_are_refused(monkeypatch: pytest.MonkeyP
         )
 
 
-def test_light_bounces_off_the_union_of_joined_bodies() -> None:
+def test_light_bounces_off_the_union_of_joined_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
     turned = trimesh.transformations.rotation_matrix(0.4, [0, 0, 1])
     turned[:3, 3] = 0.02, 0.05, 0.03
     parts = [Body.box((0.3, 0.2, 0.2), albedo=0.7), Body.box((0.15, 0.4, 0.15), albedo=0.7, pose=turned)]
     pose = trimesh.transformations.translation_matrix([1.2, 0, 0])
     joined = replace(Body.joined(parts), pose=pose)
     mesh = Body(trimesh.Trimesh(joined.mesh.vertices, joined.mesh.faces, process=False), 0.7, pose=pose)
-    found, expected = (
-        renderer._assembly.in_facets(renderer.scene.bodies, renderer.scene.poses).topology
-        for renderer in (SceneRenderer(Scene([body]), PMD) for body in (joined, mesh))
-    )
+    seen = []
+
+    def record(topology: Any, *_: Any) -> None:
+        seen.append(topology)
+        raise UsageError("enough")
+
+    monkeypatch.setattr(scene_renderer, "refined", record)
+    for body in (joined, mesh):
+        with pytest.raises(UsageError, match="enough"):
+            SceneRenderer(Scene([body]), ROOM_CAMERA, bounces=1).phasors(np.eye(4))
+    found, expected = seen
     np.testing.assert_array_equal(found.vertices[found.faces], expected.vertices[expected.faces])
     assert len(found.faces) > 24  # cut where the boxes meet
