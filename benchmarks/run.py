@@ -310,8 +310,8 @@ def chain() -> Table:
             pruned = nearest_search(plain_images, opened.distance_m, opened.delta_rad)
             exact = ExactSearch(plain_images, len(plain_images))
             rows += [
-                ("nearest of 25 380 images, exact", 200, lambda: exact.minima(seen[:200])),
-                ("nearest of 25 380 images, pruned", len(several), lambda: pruned.minima(seen)),
+                ("nearest of 25 380 images, exact", 200, lambda: exact.nearest(seen[:200])),
+                ("nearest of 25 380 images, pruned", len(several), lambda: pruned.nearest(seen)),
                 ("match, nearest of 25 380 + 564 images", len(several), lambda: plain.match(several)),
                 ("the same before a wall", len(many), lambda: matcher.match(many)),
             ]

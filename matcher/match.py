@@ -19,6 +19,8 @@ Reason = Literal["", "no landmark", "poor fit", "undetermined", "outside the ban
 """Why an answer is refused; empty if it is accepted."""
 TOLERANCE_M, TOLERANCE_RAD = 0.03, math.radians(6.0)
 """How far off an accepted answer may be, unless the matcher is told."""
+TOLERATED_SIGMA = 3.0
+"""Standard deviations that must lie within the tolerance of an accepted answer."""
 
 
 @dataclass(frozen=True)

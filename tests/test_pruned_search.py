@@ -10,7 +10,7 @@ from phasemark.matcher import Matches
 from phasemark.matcher.accuracy import TrialSetup
 from phasemark.matcher.accuracy.trials import noisy_frames
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
-from phasemark.matcher.nearest.search import ExactSearch, PrunedSearch, lowest, nearest_search
+from phasemark.matcher.nearest.search import ExactSearch, PrunedSearch, nearest_search
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.render import Background, Renderer, preset
 
@@ -55,8 +55,8 @@ def test_the_pruned_search_finds_what_comparing_every_image_finds(bank, backgrou
     matcher, exact = searches(bank, background)
     for some in frames(bank, 100, background):
         seen = Observation.from_frames(some, (8, 16))
-        found, cost = lowest(*matcher.search.minima(seen))
-        expected, least = lowest(*exact.minima(seen))
+        found, cost = matcher.search.nearest(seen)
+        expected, least = exact.nearest(seen)
         # one of 100 may end in a side valley: at the rate of 0.1 % that is asked for, two of 100 have probability 0.5 %
         assert np.sum(found != expected) <= 1
         same = found == expected
@@ -70,8 +70,8 @@ def test_every_class_of_a_full_bank_is_searched(full_bank):
     for some in frames(full_bank, 50, distance_m=(0.9, 1.1)):
         seen = Observation.from_frames(some, (0, 16))
         for block in range(2):
-            found, cost = lowest(*matcher.search.minima(seen, block))
-            expected, least = lowest(*exact.minima(seen, block))
+            found, cost = matcher.search.nearest(seen, block)
+            expected, least = exact.nearest(seen, block)
             assert (found // (len(full_bank.distance_m) * len(full_bank.delta_rad)) == block).all()
             assert np.sum(found != expected) <= 1
             assert (cost >= least * (1 - 1e-12)).all()
@@ -87,7 +87,7 @@ def test_images_of_the_grid_are_found_at_its_borders_and_across_the_seam_of_delt
     ranges = (templates.range_m[at] + templates.mean_m) % SENSOR.unambiguous_range_m
     returned = templates.may_return[at]
     seen = Observation(np.where(returned, ranges, 0.0), np.where(returned, 1e6, 0.0), returned, ~(returned | must))
-    found, cost = lowest(*matcher.search.minima(seen))
+    found, cost = matcher.search.nearest(seen)
     assert found.tolist() == at.tolist()
     assert cost.max() < 1e-3  # float64 sums of float32 ranges: (1e-7 m)² · 1e6 / m² a pixel
 
@@ -98,10 +98,10 @@ def test_a_frame_without_returns_has_an_answer_and_is_no_landmark(bank):
     absent = np.ones((1, 128), bool)
     seen = Observation(nothing, nothing, ~absent, absent)
     # flat ground, on which a descent may rest: some template of the grid, at its own distance
-    found, cost = lowest(*matcher.search.minima(seen))
-    assert cost[0] == matcher.pose.exact_costs(seen, 0, found)[0] >= lowest(*exact.minima(seen))[1][0]
+    found, cost = matcher.search.nearest(seen)
+    assert cost[0] == matcher.pose.exact_costs(seen, 0, found)[0] >= exact.nearest(seen)[1][0]
     missing = Observation(nothing, nothing, ~absent, ~absent)
-    assert lowest(*matcher.search.minima(missing))[1] == 0
+    assert matcher.search.nearest(missing)[1] == 0
 
 
 def test_irregular_and_coarse_grids_are_searched_whole(bank):

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 from phasemark.data import Bank
 from phasemark.matcher.estimate.fits import Fits, distinct
 from phasemark.matcher.information import weak_direction
-from phasemark.matcher.match import Candidate, Match, Reason
+from phasemark.matcher.match import TOLERATED_SIGMA, Candidate, Match, Reason
 from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 from phasemark.render import Background
 from phasemark.render.view import VIEW_FIELDS, delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
 
 __all__ = [
-    "TOLERATED_SIGMA",
     "Rules",
     "answer_of",
     "is_acceptable",
@@ -32,9 +31,6 @@ __all__ = [
     "with_part",
     "with_parts",
 ]
-
-TOLERATED_SIGMA = 3.0
-"""Standard deviations that must lie within the tolerance of an accepted answer."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.estimate.acceptance import TOLERATED_SIGMA, is_acceptable
+from phasemark.matcher.estimate.acceptance import is_acceptable
 from phasemark.matcher.estimate.fits import Fits, best_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene
+from phasemark.matcher.match import TOLERATED_SIGMA
 from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.render.view import delta_period_rad
 

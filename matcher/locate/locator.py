@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.estimate.acceptance import TOLERATED_SIGMA
 from phasemark.matcher.locate.kernel_arguments import Scan
 from phasemark.matcher.locate.plane import difference, relative_pose
 from phasemark.matcher.locate.pose_search import pose_grid, promising_poses
@@ -20,6 +19,7 @@ from phasemark.matcher.locate.rig import Rig
 from phasemark.matcher.locate.scan_fit import WIDTHS, StopFit, StopModel, along_profiles, fit_stop, std_without_one
 from phasemark.matcher.locate.wall_map import WallMap
 from phasemark.matcher.locate.zones_in_space import SpaceModel
+from phasemark.matcher.match import TOLERATED_SIGMA
 from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 _Float = NDArray[np.float64]

@@ -5,7 +5,8 @@ The lower pixels give distance and angle, then the upper pixels give the class, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +16,22 @@ from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, phases_wrap
-from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match, Reason
-from phasemark.matcher.nearest.search import lowest, nearest_search
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, TOLERATED_SIGMA, Candidate, Match, Reason
+from phasemark.matcher.nearest.cell_fits import CellFits, fit_cells, moved_costs
+from phasemark.matcher.nearest.grid import closing_period
+from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
 from phasemark.render import Background
-from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 __all__ = ["NearestMatcher"]
 
 _FRAMES_AT_ONCE = 128
+_STEPS = 4
+"""How often the distance that fits best at an angle is corrected: ranges change with it about as it does itself."""
+_APART_RAD = math.radians(2.0)
+"""Spacing of the angles at which rivals of the nearest image are looked for."""
 _Index = NDArray[np.int64]
 
 
@@ -33,14 +39,12 @@ _Index = NDArray[np.int64]
 class _Found:
     """The nearest template of every class: (n, classes) arrays.
 
-    `i` and `j` index distance and angle, `cost` is the distance from the frame. `minima` holds, by block of the bank,
-    the lowest minima that the search ended at and their costs, (n, k) each.
+    `i` and `j` index distance and angle, `cost` is the distance from the frame.
     """
 
     i: NDArray[np.int64]
     j: NDArray[np.int64]
     cost: NDArray[np.float64]
-    minima: tuple[tuple[NDArray[np.int64], NDArray[np.float64]], ...] = ()
 
 
 class NearestMatcher:
@@ -66,6 +70,7 @@ class NearestMatcher:
         self._bank = bank
         self._tolerance_m, self._tolerance_rad = tolerance_m, tolerance_rad
         self._false_alarm = false_alarm
+        self._closes = closing_period(bank.delta_rad) is not None
         self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
         whole = bank.full or bank.lower
@@ -118,15 +123,15 @@ class NearestMatcher:
     def _searched(self, pose_seen: Observation, class_seen: Observation | None) -> _Found:
         """Find the nearest image of each class; in a factored bank the nearest lower one, and the upper ones there."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
-        minima = tuple(self.search.minima(pose_seen, c) for c in range(n_class if class_seen is None else 1))
-        nearest = [lowest(*some) for some in minima]
-        best = np.stack([found for found, _ in nearest], axis=1) - np.arange(len(minima)) * n_distance * n_delta
+        blocks = range(n_class if class_seen is None else 1)
+        nearest = [self.search.nearest(pose_seen, c) for c in blocks]
+        best = np.stack([found for found, _ in nearest], axis=1) - np.asarray(blocks) * n_distance * n_delta
         (i, j), cost = np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1)
         if class_seen is not None:
             assert self._class is not None
             cost = cost + self._class.costs_of_each(class_seen, np.arange(n_class) * n_distance + i)
             i, j = np.repeat(i, n_class, axis=1), np.repeat(j, n_class, axis=1)
-        return _Found(i, j, cost, minima)
+        return _Found(i, j, cost)
 
     def _nothing(self) -> Templates:
         """Return the one template of a scene without a landmark."""
@@ -144,33 +149,54 @@ class NearestMatcher:
         which: NDArray[np.bool_],
         chi2: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
-        """Return which frames a view of the same class beyond the tolerance explains as well, or acceptably."""
+        """Return which frames a view beyond the tolerance, or of another class, explains about as well.
+
+        At every angle the distance that fits best is asked: a flat valley along δ has no minimum of its own.
+        """
         ambiguous = np.zeros(len(frames), np.bool_)
-        best = np.argmin(found.cost, axis=1)
-        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
-        # ratio of costs on the grid up to which another minimum may, between grid points, explain a frame as well
-        worth_a_look = 4.0
+        some = np.flatnonzero(which)
+        if not some.size:
+            return ambiguous
+        pose_seen, class_seen = pose_seen[some], None if class_seen is None else class_seen[some]
+        best = np.argmin(found.cost[some], axis=1)[:, None]
+        of_i, of_j = (np.take_along_axis(index[some], best, axis=1) for index in (found.i, found.j))
+        j = self._columns()[None]
+        # the cost of a grid point tells roughly what a frame costs in its cell
+        worth_a_fit = 8.0 * (np.take_along_axis(found.cost[some], best, axis=1) + DISAGREEMENT)
         for c in range(len(self._bank.classes)):
-            own = np.flatnonzero(which & (best == c))
-            if not own.size:
-                continue
-            block = c if class_seen is None else 0
-            at, cost = (values[own] for values in found.minima[block])
-            i, j = np.divmod(at - block * n_distance * n_delta, n_delta)
-            # a grid point is off its minimum: how much a frame costs between points is known from the best one
-            near = cost < worth_a_look * (found.cost[own, c, None] + DISAGREEMENT)
-            k, m = np.nonzero(near & self._far(c, i, j, found.i[own, c, None], found.j[own, c, None]))
-            if not k.size:
-                continue
-            frame = own[k]
-            shape = len(k), len(self._bank.classes)
-            others = _Found(np.zeros(shape, np.int64), np.zeros(shape, np.int64), np.full(shape, np.inf))
-            others.i[:, c], others.j[:, c], others.cost[:, c] = i[k, m], j[k, m], cost[k, m]
-            theirs, dof = self._goodness(pose_seen[frame], None if class_seen is None else class_seen[frame], others)
-            as_good = theirs < chi2[frame] + DISAGREEMENT
-            as_good |= p_values_of(theirs, dof, noise_tails(frames[frame])) >= self._false_alarm
-            ambiguous[frame[as_good]] = True
+            if c == 0 or class_seen is None:
+                i, cost = self._best_distances(pose_seen, c, found.i[some, c], j)
+            is_near = cost < worth_a_fit
+            is_other = (best != c) | self._far(c, i, j, of_i, of_j)
+            theirs, dof = self._cells(pose_seen, class_seen, c, i, j, is_near & is_other)
+            is_minimum = _is_minimum(np.where(is_other, theirs, -np.inf))
+            as_good = theirs < chi2[some, None] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
+            # a minimum that would be accepted itself, too
+            k, m = np.nonzero(is_minimum & is_near & is_other)
+            as_good[k, m] |= p_values_of(theirs[k, m], dof[k, m], noise_tails(frames[some[k]])) >= self._false_alarm
+            ambiguous[some] |= as_good.any(axis=1)
         return ambiguous
+
+    def _best_distances(
+        self, seen: Observation, block: int, start: _Index, j: _Index
+    ) -> tuple[_Index, NDArray[np.float64]]:
+        """Return which distances fit n frames best at k angles (1, k), and what they cost about there; (n, k)."""
+        distance_m, n_delta = self._bank.distance_m, len(self._bank.delta_rad)
+        between = (distance_m[1:] + distance_m[:-1]) / 2
+        i = np.repeat(start[:, None], j.shape[1], axis=1)
+        for _ in range(_STEPS):
+            at = (block * len(distance_m) + i) * n_delta + j
+            _, moved_m = moved_costs(self.pose, seen, at, math.inf)
+            i = np.searchsorted(between, distance_m[i] + moved_m)
+        at = (block * len(distance_m) + i) * n_delta + j
+        cost, _ = moved_costs(self.pose, seen, at, float(np.diff(distance_m).max(initial=0.0)))
+        return i, cost
+
+    def _columns(self) -> _Index:
+        """Return which angles of the grid are asked for rivals."""
+        delta_rad = self._bank.delta_rad
+        step = np.diff(delta_rad).min(initial=_APART_RAD)
+        return np.arange(0, len(delta_rad), max(int(_APART_RAD / step + 1e-9), 1))
 
     def _far(self, class_index: int, i: _Index, j: _Index, of_i: _Index, of_j: _Index) -> NDArray[np.bool_]:
         """Return which views of the grid are beyond the tolerance, and more than a cell, from others."""
@@ -231,74 +257,34 @@ class NearestMatcher:
         self, pose_seen: Observation, class_seen: Observation | None, found: _Found
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
-        c = np.argmin(found.cost, axis=1)
-        i, j = (np.take_along_axis(index, c[:, None], axis=1)[:, 0] for index in (found.i, found.j))
-        cells = self._cells_at(pose_seen, c if class_seen is None else np.zeros_like(c), i, j)
+        c = np.argmin(found.cost, axis=1)[:, None]
+        i, j = (np.take_along_axis(index, c, axis=1) for index in (found.i, found.j))
+        fits = self._cells(pose_seen, class_seen, c, i, j, np.ones(c.shape, np.bool_))
+        return fits.chi2[:, 0], fits.dof[:, 0]
+
+    def _cells(
+        self,
+        pose_seen: Observation,
+        class_seen: Observation | None,
+        c: _Index | int,
+        i: _Index,
+        j: _Index,
+        asked: NDArray[np.bool_],
+    ) -> CellFits:
+        """Fit the frames in the cells around grid points, (n, k) each, those that are asked for."""
+        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
+        rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=-1)
+        columns = np.stack([j, j, j, j - 1, j + 1], axis=-1)
+        columns = columns % n_delta if self._closes else np.clip(columns, 0, n_delta - 1)
+        of_class = np.asarray(c)[..., None] * n_distance + rows
+        block = of_class if class_seen is None else rows
+        groups = [(self.pose, pose_seen, np.where(asked[..., None], block * n_delta + columns, -1))]
         if class_seen is not None:
             assert self._class is not None
-            n_distance = len(self._bank.distance_m)
-            cells = cells.beside(_Cells.of(self._class, class_seen, c[:, None] * n_distance + self._rows_around(i)))
-        chi2, n_fitted = cells.chi2()
-        return chi2, np.maximum(n_fitted - 2, 0)
-
-    def _rows_around(self, i: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the indices of distance of grid points and of their neighbours, (n, 5)."""
-        last = len(self._bank.distance_m) - 1
-        return np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, last), i, i], axis=1)
-
-    def _cells_at(
-        self, seen: Observation, block: NDArray[np.int64], i: NDArray[np.int64], j: NDArray[np.int64]
-    ) -> _Cells:
-        """Return the cells around a grid point for each frame, of the templates that give distance and angle."""
-        n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
-        columns = np.stack([j, j, j, (j - 1) % n_delta, (j + 1) % n_delta], axis=1)
-        at = (block[:, None] * n_distance + self._rows_around(i)) * n_delta + columns
-        return _Cells.of(self.pose, seen, at)
+            groups.append((self._class, class_seen, np.where(asked[..., None], of_class, -1)))
+        return fit_cells(groups)
 
 
-@dataclass(frozen=True, eq=False)
-class _Cells:
-    """Residuals of n frames at a grid point each, and how their models change over the cell; (n, pixels) arrays.
-
-    `variance` is infinite where frame and models cannot be compared. `slope` is the change of range over one step of
-    distance and of angle, (n, pixels, 2); `bend` what a linear change leaves over half a step; `disagrees` counts a
-    pixel whose return the model contradicts at the grid point and at all its neighbours.
-    """
-
-    residual: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    slope: NDArray[np.float64]
-    bend: NDArray[np.float64]
-    disagrees: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, templates: Templates, seen: Observation, at: NDArray[np.integer]) -> _Cells:
-        """Look at grid points `at`, (n, 5): the point itself, then its neighbours in distance and in angle."""
-        may, must = templates.may_return[at], templates.must_return[at]
-        usable = seen.returned & may.all(axis=1)
-        model = templates.range_m[at].astype(np.float64)
-        step = wrap_difference_m(model[:, 1:] - model[:, :1], templates.sensor)
-        residual = wrap_difference_m(templates.about(seen) - model[:, 0], templates.sensor)
-        slope = np.stack([step[:, 1] - step[:, 0], step[:, 3] - step[:, 2]], axis=-1) / 2
-        bend = (np.abs(step[:, 1] + step[:, 0]) + np.abs(step[:, 3] + step[:, 2])) / 2
-        lost = seen.returned & ~may.any(axis=1)
-        absent = seen.not_returned & must.all(axis=1)
-        variance = np.divide(1.0, seen.weight, out=np.full(usable.shape, np.inf), where=usable)
-        return cls(residual, variance, slope, bend, lost | absent)
-
-    def beside(self, other: _Cells) -> _Cells:
-        """Add further pixels of the same frames."""
-        return _Cells(*(np.concatenate([getattr(c, f.name) for c in (self, other)], axis=1) for f in fields(self)))
-
-    def chi2(self) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Fit the positions in the cells and return χ² with the number of pixels in it; (n,) each."""
-        weight = 1 / (self.variance + self.bend**2)
-        n_compared = np.isfinite(self.variance).sum(axis=1)
-        weighted = self.slope * weight[..., None]
-        # what the pixels do not tell stays 0: the least solution of the normal equations
-        inverse = np.linalg.pinv(self.slope.transpose(0, 2, 1) @ weighted, rcond=1e-12, hermitian=True)
-        offset = np.einsum("nij,npj,np->ni", inverse, weighted, self.residual, optimize=True)
-        offset = np.clip(offset, -0.6, 0.6) * (n_compared >= MIN_RETURNS)[:, None]
-        left = self.residual - np.einsum("npi,ni->np", self.slope, offset)
-        n_disagree = self.disagrees.sum(axis=1)
-        return np.sum(weight * left**2, axis=1) + DISAGREEMENT * n_disagree, n_compared + n_disagree
+def _is_minimum(values: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which values are no higher than those beside them, along the last axis, whose ends are joined."""
+    return np.asarray((values <= np.roll(values, 1, axis=-1)) & (values <= np.roll(values, -1, axis=-1)))

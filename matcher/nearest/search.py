@@ -37,32 +37,20 @@ class ExactSearch:
         Blocks, one behind the other.
     size : int
         Templates in a block.
-    n_delta : int, optional
-        Angles of the grid, δ running fastest; None: one.
-    closes : bool
-        Whether the last angle is next to the first.
     """
 
-    def __init__(self, templates: Templates, size: int, n_delta: int | None = None, *, closes: bool = False) -> None:
+    def __init__(self, templates: Templates, size: int) -> None:
         self._templates = templates
         self._size = size
-        self._shape = size // (n_delta or 1), n_delta or 1
-        self._closes = closes
 
-    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return the lowest minima of one block for each of n frames, (n, k), and their distances.
-
-        Some may be the same; where there are fewer, the index is that of the first template and the distance infinite.
-        """
+    def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the nearest template of one block for each of n frames, (n,), and its distance."""
         first = block * self._size
         costs = self._templates.costs(seen, slice(first, first + self._size))
-        found, cost = _minima(costs.reshape(len(costs), 1, *self._shape), _N_STARTS, self._closes)
         best, least = np.zeros(len(costs), np.int64), np.zeros(len(costs))
         for k, row in enumerate(costs):
             best[k], least[k] = self._templates.best(seen, k, row, offset=first)
-        # the costs of all templates are float32 products; the best one is known exactly
-        cost = np.maximum(cost, least[:, None])
-        return np.column_stack([best, found + first]), np.column_stack([least, cost])
+        return best, least
 
 
 class PrunedSearch:
@@ -99,8 +87,8 @@ class PrunedSearch:
         block = np.arange(math.prod(self._shape)).reshape(self._shape)[:: stride[0], :: stride[1]].ravel()
         self._thin = [templates[first + block] for first in range(0, len(templates), math.prod(self._shape))]
 
-    def minima(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Return where the descents end that start at the lowest minima of the thinned grid, (n, k), and the costs."""
+    def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the lowest end of the descents that start at the lowest minima of the thinned grid, and its cost."""
         t = self._templates
         shape = len(seen.range_m), 1, len(self._i), len(self._j)
         size = math.prod(self._shape)
@@ -120,12 +108,6 @@ class PrunedSearch:
         return found + picked.start, cost
 
 
-def lowest(found: NDArray[np.int64], cost: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the lowest of the minima of each frame, and its cost; (n,) each."""
-    best = np.argmin(cost, axis=1)[:, None]
-    return np.take_along_axis(found, best, axis=1)[:, 0], np.take_along_axis(cost, best, axis=1)[:, 0]
-
-
 def nearest_search(
     templates: Templates,
     distance_m: NDArray[np.float64],
@@ -142,9 +124,7 @@ def nearest_search(
         least_thinning = 4  # A grid that is thinned by less than this is searched whole.
         if math.prod(stride) >= least_thinning:
             return PrunedSearch(templates, distance_m, delta_rad, stride, reach)
-    n_delta = len(delta_rad)
-    closes = steps[1] is not None and closing_period(delta_rad) is not None
-    return ExactSearch(templates, len(distance_m) * n_delta, n_delta, closes=closes)
+    return ExactSearch(templates, len(distance_m) * len(delta_rad))
 
 
 def _regular_step(values: NDArray[np.float64]) -> float | None:
@@ -158,14 +138,13 @@ def _at_least_one(steps: float) -> int:
 
 @njit(cache=True, nogil=True)
 def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, period):  # type: ignore[no-untyped-def]
-    """Return the lowest points of the grid that descents reach, and their costs, for every frame."""
+    """Return the lowest point of the grid that descents reach, and its cost, for every frame."""
     about, weight, lost, absent = seen
     range_m, may, must = model
     reach_i, reach_j = reach
     n, n_points = len(about), len(range_m)
     n_d = n_points // n_a
-    found = np.zeros((n, n_starts), np.int64)
-    lowest = np.full((n, n_starts), np.inf)
+    found, lowest = np.zeros(n, np.int64), np.full(n, np.inf)
     cost = np.empty(n_points)
     known_to = np.full(n_points, -1, np.int32)
     for k in range(n):
@@ -196,23 +175,8 @@ def _descend(thin, n_starts, thin_i, thin_j, n_a, closes, reach, seen, model, pe
                             best, at = cost[c], c
                 if at == centre:
                     break
-            lowest[k, s], found[k, s] = best, at
-    return found, lowest
-
-
-@njit(cache=True, nogil=True)
-def _minima(costs, n_minima, closes):  # type: ignore[no-untyped-def]
-    """Return the lowest local minima of grids (n, 1, distance, δ), flattened, and their costs; (n, n_minima) each."""
-    n, n_a = len(costs), costs.shape[3]
-    found = np.zeros((n, n_minima), np.int64)
-    lowest = np.full((n, n_minima), np.inf)
-    for k in range(n):
-        starts = modes(costs[k : k + 1], 0, n_minima, closes, 1)
-        for s in range(n_minima):
-            _, i, j = starts[s]
-            if i < 0:
-                break
-            found[k, s], lowest[k, s] = i * n_a + j, costs[k, 0, i, j]
+            if best < lowest[k]:
+                lowest[k], found[k] = best, at
     return found, lowest
 
 

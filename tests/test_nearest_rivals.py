@@ -1,0 +1,105 @@
+"""The nearest image is accepted where no other view of the bank explains a frame about as well."""
+
+import math
+
+import numpy as np
+import pytest
+import trimesh
+
+from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans import MeshPlan
+from phasemark.matcher import Matcher, kalman_filter
+from phasemark.matcher.nearest.cell_fits import fit_cells
+from phasemark.matcher.nearest.templates import Observation, Templates
+from phasemark.render import Background, Renderer, capture, preset
+
+PRESET = "vl53l5cx-8x8"
+SENSOR = preset(PRESET)
+N = 60
+
+
+def gear(teeth: int) -> trimesh.Trimesh:
+    """Return a flat gear about the z axis."""
+    turn = 2 * np.pi * (np.arange(4 * teeth) / 4) / teeth
+    radius = np.tile([0.12, 0.15, 0.15, 0.12], teeth)
+    rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn)])
+    n = len(rim)
+    points = np.vstack(
+        [np.column_stack([rim, np.full(n, z)]) for z in (-0.03, 0.03)] + [np.array([[0, 0, -0.03], [0, 0, 0.03]])]
+    )
+    k, after = np.arange(n), np.roll(np.arange(n), -1)
+    sides = np.vstack([np.column_stack([k, after, after + n]), np.column_stack([k, after + n, k + n])])
+    ends = [np.column_stack([after, k, np.full(n, 2 * n)]), np.column_stack([k + n, after + n, np.full(n, 2 * n + 1)])]
+    return trimesh.Trimesh(points, np.vstack([sides, *ends]))
+
+
+def notched() -> trimesh.Trimesh:
+    """Return a box that a corner is missing of."""
+    corner = trimesh.creation.box((0.06, 0.06, 0.06))
+    corner.apply_translation((0.1, 0.1, 0.125))
+    part: trimesh.Trimesh = trimesh.boolean.difference([trimesh.creation.box((0.2, 0.2, 0.25)), corner])
+    return part
+
+
+@pytest.fixture(scope="module")
+def bank(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("parts")
+    parts = {"gear": gear(9), "box": trimesh.creation.box((0.20, 0.212, 0.25)), "notched": notched()}
+    plans = []
+    for name, mesh in parts.items():
+        mesh.export(folder / f"{name}.stl")
+        plans.append(MeshPlan(name=name, path=str(folder / f"{name}.stl"), unit="m"))
+    plan = BankPlan(meshes=tuple(plans), sensor=PRESET, distance_m="0.5:1.1:0.02", delta_deg="0:360:2", layout="full")
+    with build_bank(plan, folder / "parts.h5") as built:
+        yield built
+
+
+@pytest.mark.parametrize("background", [None, Background(wall_m=2.5)], ids=["nothing", "wall"])
+@pytest.mark.parametrize(("name", "period_deg", "least"), [("gear", 40, 5), ("box", 180, 10), ("notched", 360, 2)])
+def test_an_accepted_image_is_of_the_class_and_near_the_view(bank, name, period_deg, least, background):
+    # a valley along the angle, a side that looks like its neighbour, and another class that looks the same
+    rng = np.random.default_rng(5)
+    distance_m, delta_rad = rng.uniform(0.62, 1.0, N), rng.uniform(0, 2 * np.pi, N)
+    image = Renderer(bank.mesh(name), SENSOR).render(distance_m, delta_rad, background=background)
+    matches = Matcher(bank, "nearest", background=background).match(
+        kalman_filter(capture(image, SENSOR, rng=rng, n_frames=10))
+    )
+    period = math.radians(period_deg)
+    off = np.abs((matches.delta_rad - delta_rad + period / 2) % period - period / 2)
+    right = (off <= math.radians(6)) & (np.abs(matches.distance_m - distance_m) <= 0.03)
+    right &= np.array(matches.class_name) == name
+    assert not (matches.accepted & ~right).any()
+    assert (matches.accepted & right).sum() >= least
+    assert "ambiguous" in set(matches.reason)
+
+
+def test_a_fit_in_a_cell_is_the_weighted_least_squares_of_its_pixels():
+    # ranges that are linear in distance and angle, as they are seen: numpy's least squares tells χ² and the position
+    rng = np.random.default_rng(2)
+    slope = rng.normal(0, 0.01, (2, 30))
+    grid = np.array([[0, 0], [-1, 0], [1, 0], [0, -1], [0, 1]])
+    ranges = 1.0 + grid @ slope
+    every, none = np.ones((5, 30), bool), np.zeros((5, 30), bool)
+    images = Templates(ranges.astype(np.float32), every, none, np.zeros(30), SENSOR)
+    std = rng.uniform(0.001, 0.003, 30)
+    seen_m = 1.0 + np.array([0.2, -0.3]) @ slope + rng.normal(0, std)
+    seen = Observation(seen_m[None], 1 / std[None] ** 2, every[:1], none[:1])
+    fits = fit_cells([(images, seen, np.array([[[0, 1, 2, 3, 4], [-1, 0, 0, 0, 0]]]))])
+    _, left, *_ = np.linalg.lstsq((slope / std).T, (seen_m - 1.0) / std)
+    assert fits.chi2[0, 0] == pytest.approx(left[0], rel=1e-3)  # images are float32
+    assert fits.dof.tolist() == [[28, 0]]
+    assert fits.chi2[0, 1] == np.inf
+    # at the end of the grid a change goes on as on its other side
+    ends = fit_cells([(images, seen, np.array([[[0, 0, 2, 3, 0]]]))])
+    assert ends.chi2[0, 0] == pytest.approx(left[0], rel=1e-3)
+
+
+def test_what_a_cell_cannot_show_costs_a_disagreement_in_each_pixel():
+    every, none = np.ones((5, 4), bool), np.zeros((5, 4), bool)
+    flat, at = np.full((5, 4), 1.0, np.float32), np.arange(5)[None, None]
+    lost = Observation(np.ones((1, 4)), np.full((1, 4), 1e6), every[:1], none[:1])
+    assert fit_cells([(Templates(flat, none, none, np.zeros(4), SENSOR), lost, at)]).chi2[0, 0] == 100
+    absent = Observation(np.zeros((1, 4)), np.zeros((1, 4)), none[:1], every[:1])
+    assert fit_cells([(Templates(flat, every, every, np.zeros(4), SENSOR), absent, at)]).chi2[0, 0] == 100
+    some = np.vstack([every[:4], none[:1]])
+    assert fit_cells([(Templates(flat, some, some, np.zeros(4), SENSOR), absent, at)]).chi2[0, 0] == 0
