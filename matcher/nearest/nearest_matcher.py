@@ -70,6 +70,7 @@ class NearestMatcher:
         self._bank = bank
         self._tolerance_m, self._tolerance_rad = tolerance_m, tolerance_rad
         self._false_alarm = false_alarm
+        self._step_m = float(np.diff(bank.distance_m).max(initial=0.0))
         self._closes = closing_period(bank.delta_rad) is not None
         self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
@@ -160,36 +161,45 @@ class NearestMatcher:
         pose_seen, class_seen = pose_seen[some], None if class_seen is None else class_seen[some]
         best = np.argmin(found.cost[some], axis=1)[:, None]
         of_i, of_j = (np.take_along_axis(index[some], best, axis=1) for index in (found.i, found.j))
-        j = self._columns()[None]
+        columns = self._columns()
+        frame, j = (index.ravel() for index in np.indices((len(some), len(columns))))
+        j = columns[j]
         # the cost of a grid point tells roughly what a frame costs in its cell
-        worth_a_fit = 8.0 * (np.take_along_axis(found.cost[some], best, axis=1) + DISAGREEMENT)
+        worth_a_fit = 8.0 * (np.take_along_axis(found.cost[some], best, axis=1)[:, 0] + DISAGREEMENT)
         for c in range(len(self._bank.classes)):
             if c == 0 or class_seen is None:
-                i, cost = self._best_distances(pose_seen, c, found.i[some, c], j)
-            is_near = cost < worth_a_fit
-            is_other = (best != c) | self._far(c, i, j, of_i, of_j)
-            theirs, dof = self._cells(pose_seen, class_seen, c, i, j, is_near & is_other)
-            is_minimum = _is_minimum(np.where(is_other, theirs, -np.inf))
-            as_good = theirs < chi2[some, None] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
+                i, cost = self._best_distances(pose_seen, frame, c, found.i[some, c], j)
+            is_other = (best[frame, 0] != c) | self._far(c, i, j, of_i[frame, 0], of_j[frame, 0])
+            asked = np.flatnonzero(is_other & (cost < worth_a_fit[frame]))
+            if class_seen is not None:
+                assert self._class is not None
+                of_class = self._class, class_seen, c * len(self._bank.distance_m) + i[asked]
+                cost_of_class, _ = moved_costs(of_class, frame[asked], self._step_m)
+                asked = asked[cost[asked] + cost_of_class < worth_a_fit[frame[asked]]]
+            own = frame[asked]
+            theirs, dof = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
+            ladder = np.where(is_other, np.inf, -np.inf)
+            ladder[asked] = theirs
+            is_minimum = _is_minimum(ladder.reshape(len(some), -1)).ravel()[asked]
+            as_good = theirs < chi2[some[own]] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
             # a minimum that would be accepted itself, too
-            k, m = np.nonzero(is_minimum & is_near & is_other)
-            as_good[k, m] |= p_values_of(theirs[k, m], dof[k, m], noise_tails(frames[some[k]])) >= self._false_alarm
-            ambiguous[some] |= as_good.any(axis=1)
+            as_good |= is_minimum & (p_values_of(theirs, dof, noise_tails(frames[some[own]])) >= self._false_alarm)
+            ambiguous[some[own[as_good]]] = True
         return ambiguous
 
     def _best_distances(
-        self, seen: Observation, block: int, start: _Index, j: _Index
+        self, seen: Observation, frame: _Index, block: int, start: _Index, j: _Index
     ) -> tuple[_Index, NDArray[np.float64]]:
-        """Return which distances fit n frames best at k angles (1, k), and what they cost about there; (n, k)."""
+        """Return which distances fit frames best at angles, and what they cost about there; (m,) each."""
         distance_m, n_delta = self._bank.distance_m, len(self._bank.delta_rad)
         between = (distance_m[1:] + distance_m[:-1]) / 2
-        i = np.repeat(start[:, None], j.shape[1], axis=1)
+        i = start[frame]
         for _ in range(_STEPS):
             at = (block * len(distance_m) + i) * n_delta + j
-            _, moved_m = moved_costs(self.pose, seen, at, math.inf)
+            _, moved_m = moved_costs((self.pose, seen, at), frame, math.inf)
             i = np.searchsorted(between, distance_m[i] + moved_m)
         at = (block * len(distance_m) + i) * n_delta + j
-        cost, _ = moved_costs(self.pose, seen, at, float(np.diff(distance_m).max(initial=0.0)))
+        cost, _ = moved_costs((self.pose, seen, at), frame, self._step_m)
         return i, cost
 
     def _columns(self) -> _Index:
@@ -253,36 +263,31 @@ class NearestMatcher:
         weight = np.exp(-0.5 * (values - values.min()))
         return dict(zip(names, (weight / weight.sum()).tolist(), strict=True))
 
-    def _goodness(
-        self, pose_seen: Observation, class_seen: Observation | None, found: _Found
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    def _goodness(self, pose_seen: Observation, class_seen: Observation | None, found: _Found) -> CellFits:
         """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
-        c = np.argmin(found.cost, axis=1)[:, None]
-        i, j = (np.take_along_axis(index, c, axis=1) for index in (found.i, found.j))
-        fits = self._cells(pose_seen, class_seen, c, i, j, np.ones(c.shape, np.bool_))
-        return fits.chi2[:, 0], fits.dof[:, 0]
+        frame, c = np.arange(len(found.cost)), np.argmin(found.cost, axis=1)
+        return self._cells(pose_seen, class_seen, frame, c, found.i[frame, c], found.j[frame, c])
 
     def _cells(
         self,
         pose_seen: Observation,
         class_seen: Observation | None,
-        c: _Index | int,
+        frame: _Index,
+        c: _Index,
         i: _Index,
         j: _Index,
-        asked: NDArray[np.bool_],
     ) -> CellFits:
-        """Fit the frames in the cells around grid points, (n, k) each, those that are asked for."""
+        """Fit frames in the cells around grid points, (m,) each."""
         n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
         rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=-1)
         columns = np.stack([j, j, j, j - 1, j + 1], axis=-1)
         columns = columns % n_delta if self._closes else np.clip(columns, 0, n_delta - 1)
-        of_class = np.asarray(c)[..., None] * n_distance + rows
-        block = of_class if class_seen is None else rows
-        groups = [(self.pose, pose_seen, np.where(asked[..., None], block * n_delta + columns, -1))]
+        of_class = c[:, None] * n_distance + rows
+        groups = [(self.pose, pose_seen, (of_class if class_seen is None else rows) * n_delta + columns)]
         if class_seen is not None:
             assert self._class is not None
-            groups.append((self._class, class_seen, np.where(asked[..., None], of_class, -1)))
-        return fit_cells(groups)
+            groups.append((self._class, class_seen, of_class))
+        return fit_cells(groups, frame)
 
 
 def _is_minimum(values: NDArray[np.float64]) -> NDArray[np.bool_]:
