@@ -46,6 +46,9 @@ class _Found:
     j: NDArray[np.int64]
     cost: NDArray[np.float64]
 
+    def __getitem__(self, index: _Index) -> _Found:
+        return _Found(self.i[index], self.j[index], self.cost[index])
+
 
 class NearestMatcher:
     """Finds the nearest image of a bank; see :class:`~phasemark.matcher.Matcher` for the parameters.
@@ -104,8 +107,11 @@ class NearestMatcher:
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
         chi2, dof = self._goodness(pose_seen, class_seen, found)
         p_value = p_values_of(chi2, dof, noise_tails(frames))
-        good = enough & (p_value >= self._false_alarm)
-        ambiguous = self._is_ambiguous(frames, pose_seen, class_seen, found, good, chi2)
+        ambiguous = np.zeros(len(frames), np.bool_)
+        good = np.flatnonzero(enough & (p_value >= self._false_alarm))
+        if good.size:
+            its_class = None if class_seen is None else class_seen[good]
+            ambiguous[good] = self._have_rivals(frames[good], pose_seen[good], its_class, found[good], chi2[good])
         nothing = Match(
             class_name=None,
             accepted=False,
@@ -141,51 +147,47 @@ class NearestMatcher:
         nothing = np.zeros(shape, np.complex64), np.zeros(shape, np.float32)
         return Templates.of_parts([nothing], sensor, self._behind, (0, sensor.rows))
 
-    def _is_ambiguous(
+    def _have_rivals(
         self,
         frames: FilteredFrames,
         pose_seen: Observation,
         class_seen: Observation | None,
         found: _Found,
-        which: NDArray[np.bool_],
         chi2: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         """Return which frames a view beyond the tolerance, or of another class, explains about as well.
 
         At every angle the distance that fits best is asked: a flat valley along δ has no minimum of its own.
         """
-        ambiguous = np.zeros(len(frames), np.bool_)
-        some = np.flatnonzero(which)
-        if not some.size:
-            return ambiguous
-        pose_seen, class_seen = pose_seen[some], None if class_seen is None else class_seen[some]
-        best = np.argmin(found.cost[some], axis=1)[:, None]
-        of_i, of_j = (np.take_along_axis(index[some], best, axis=1) for index in (found.i, found.j))
-        columns = self._columns()
-        frame, j = (index.ravel() for index in np.indices((len(some), len(columns))))
-        j = columns[j]
+        n, columns = len(frames), self._columns()
+        frame, j = np.repeat(np.arange(n), len(columns)), np.tile(columns, n)
+        best = np.argmin(found.cost, axis=1)
+        best_i, best_j, best_cost = (values[np.arange(n), best][frame] for values in (found.i, found.j, found.cost))
         # the cost of a grid point tells roughly what a frame costs in its cell
-        worth_a_fit = 8.0 * (np.take_along_axis(found.cost[some], best, axis=1)[:, 0] + DISAGREEMENT)
+        limit = 8.0 * (best_cost + DISAGREEMENT)
+        rivalled = np.zeros(n, np.bool_)
         for c in range(len(self._bank.classes)):
             if c == 0 or class_seen is None:
-                i, cost = self._best_distances(pose_seen, frame, c, found.i[some, c], j)
-            is_other = (best[frame, 0] != c) | self._far(c, i, j, of_i[frame, 0], of_j[frame, 0])
-            asked = np.flatnonzero(is_other & (cost < worth_a_fit[frame]))
+                i, cost = self._best_distances(pose_seen, frame, c, found.i[:, c], j)
+            is_other = (best[frame] != c) | self._far(c, i, j, best_i, best_j)
+            asked = np.flatnonzero(is_other & (cost < limit))
             if class_seen is not None:
                 assert self._class is not None
                 of_class = self._class, class_seen, c * len(self._bank.distance_m) + i[asked]
                 cost_of_class, _ = moved_costs(of_class, frame[asked], self._step_m)
-                asked = asked[cost[asked] + cost_of_class < worth_a_fit[frame[asked]]]
+                asked = asked[cost[asked] + cost_of_class < limit[asked]]
+            if not asked.size:
+                continue
             own = frame[asked]
             theirs, dof = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
-            ladder = np.where(is_other, np.inf, -np.inf)
-            ladder[asked] = theirs
-            is_minimum = _is_minimum(ladder.reshape(len(some), -1)).ravel()[asked]
-            as_good = theirs < chi2[some[own]] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
+            along_delta = np.where(is_other, np.inf, -np.inf)
+            along_delta[asked] = theirs
+            is_minimum = _is_minimum(along_delta.reshape(n, len(columns))).ravel()[asked]
+            as_good = theirs < chi2[own] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
             # a minimum that would be accepted itself, too
-            as_good |= is_minimum & (p_values_of(theirs, dof, noise_tails(frames[some[own]])) >= self._false_alarm)
-            ambiguous[some[own[as_good]]] = True
-        return ambiguous
+            as_good |= is_minimum & (p_values_of(theirs, dof, noise_tails(frames[own])) >= self._false_alarm)
+            rivalled[own[as_good]] = True
+        return rivalled
 
     def _best_distances(
         self, seen: Observation, frame: _Index, block: int, start: _Index, j: _Index
