@@ -573,10 +573,12 @@ def rig_lines(drive, names):
 
 def test_lines_of_a_rig_s_sensors_are_frames_and_unknown_or_silent_sensors_are_told():
     wall_map, rig, path, drive = rig_drive()
-    board = FakeBoard(rig_lines(drive, rig.names), 30)
-    source = open_rig_source(board.on_terminal(), rig)
-    updates, _ = run(source, MapTracker(Locator(wall_map, rig), 0.5, 1.0), until=lambda found: board.is_done.is_set())
-    board.unplug()
+    for _ in range(2):  # compiled code is loaded with the first frames, while others are dropped
+        board = FakeBoard(rig_lines(drive, rig.names), 30)
+        source = open_rig_source(board.on_terminal(), rig)
+        tracker = MapTracker(Locator(wall_map, rig), 0.5, 1.0)
+        updates, _ = run(source, tracker, until=lambda found, done=board.is_done: done.is_set())
+        board.unplug()
     accepted = [one for one in updates if not one.reason]
     assert len(accepted) >= 4  # of 8, some of which a busy machine may drop
     for one in accepted:
