@@ -10,6 +10,7 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.nearest.cell_fits import fit_cells
+from phasemark.matcher.nearest.nearest_matcher import _is_minimum
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Renderer, capture, preset
 
@@ -107,3 +108,9 @@ def test_what_a_cell_cannot_show_costs_a_disagreement_in_each_pixel():
     assert cost(absent, every, every) == 100
     some = np.vstack([every[:4], none[:1]])
     assert cost(absent, some, some) == cost(lost, some, some) == 0
+
+
+def test_an_end_of_the_angles_may_be_a_minimum_unless_they_close():
+    cost = np.array([[1.0, 2.0, 3.0, 0.0]])
+    assert _is_minimum(cost, closes=False).tolist() == [[True, False, False, True]]
+    assert _is_minimum(cost, closes=True).tolist() == [[False, False, False, True]]

@@ -182,7 +182,7 @@ class NearestMatcher:
             theirs, dof = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
             along_delta = np.where(is_other, np.inf, -np.inf)
             along_delta[asked] = theirs
-            is_minimum = _is_minimum(along_delta.reshape(n, len(columns))).ravel()[asked]
+            is_minimum = _is_minimum(along_delta.reshape(n, len(columns)), closes=self._closes).ravel()[asked]
             as_good = theirs < chi2[own] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
             # a minimum that would be accepted itself, too
             as_good |= is_minimum & (p_values_of(theirs, dof, noise_tails(frames[own])) >= self._false_alarm)
@@ -292,6 +292,9 @@ class NearestMatcher:
         return fit_cells(groups, frame)
 
 
-def _is_minimum(values: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which values are no higher than those beside them, along the last axis, whose ends are joined."""
-    return np.asarray((values <= np.roll(values, 1, axis=-1)) & (values <= np.roll(values, -1, axis=-1)))
+def _is_minimum(values: NDArray[np.float64], *, closes: bool) -> NDArray[np.bool_]:
+    """Return which values are no higher than those beside them, along the last axis, whose ends may be joined."""
+    before, behind = np.roll(values, 1, axis=-1), np.roll(values, -1, axis=-1)
+    if not closes:
+        before[..., 0] = behind[..., -1] = np.inf
+    return np.asarray((values <= before) & (values <= behind))
