@@ -9,14 +9,14 @@ import trimesh
 from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.nearest.cell_fits import fit_cells
+from phasemark.matcher.nearest.cell_fits import best_moves, fit_cells, follow_distance, moved_costs
 from phasemark.matcher.nearest.nearest_matcher import _is_minimum
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.render import Background, Renderer, capture, preset
 
 PRESET = "vl53l5cx-8x8"
 SENSOR = preset(PRESET)
-N = 60
+N = 200
 
 
 def gear(teeth: int) -> trimesh.Trimesh:
@@ -56,7 +56,7 @@ def bank(tmp_path_factory):
 
 
 @pytest.mark.parametrize("background", [None, Background(wall_m=2.5)], ids=["nothing", "wall"])
-@pytest.mark.parametrize(("name", "period_deg", "least"), [("gear", 40, 5), ("box", 180, 10), ("notched", 360, 2)])
+@pytest.mark.parametrize(("name", "period_deg", "least"), [("gear", 40, 20), ("box", 180, 40), ("notched", 360, 20)])
 def test_an_accepted_image_is_of_the_class_and_near_the_view(bank, name, period_deg, least, background):
     # a valley along the angle, a side that looks like its neighbour, and another class that looks the same
     rng = np.random.default_rng(5)
@@ -107,7 +107,51 @@ def test_what_a_cell_cannot_show_costs_a_disagreement_in_each_pixel():
     assert cost(lost, none, none) == 100
     assert cost(absent, every, every) == 100
     some = np.vstack([every[:4], none[:1]])
-    assert cost(absent, some, some) == cost(lost, some, some) == 0
+    assert cost(absent, some, some) == 0
+
+
+def test_returns_that_are_undecided_cost_one_each_among_fits_and_place_no_landmark_alone():
+    seen = Observation(np.ones((1, 8)), np.full((1, 8), 1e6), np.ones((1, 8), bool), np.zeros((1, 8), bool))
+
+    def fit(compared):
+        may = np.ones((5, 8), bool)
+        may[4, compared:] = False
+        images = Templates(np.ones((5, 8), np.float32), may, np.zeros_like(may), np.zeros(8), SENSOR)
+        return fit_cells([(images, seen, np.arange(5)[None])], np.zeros(1, np.int64))
+
+    assert (fit(6).chi2[0], fit(6).dof[0], fit(6).cost[0]) == (0, 4, 2)
+    assert (fit(2).chi2[0], fit(2).cost[0]) == (25 * 2, 25 * 8)
+
+
+def test_pixels_that_follow_the_distance_move_and_a_wall_and_edges_stay():
+    # three pixels of a landmark, one at its edge, four of a wall; the frame is 3 cm beyond the first template
+    distance_m, wall_m = np.array([0.8, 0.82, 0.84]), 2.0
+    ranges = np.full((3, 8), wall_m)
+    ranges[:, :3] = distance_m[:, None] + [0.0, 0.01, 0.03]
+    ranges[:, 3] = [1.0, 1.3, 1.6]
+    may = np.ones((3, 8), bool)
+    images = Templates(ranges.astype(np.float32), may, may, np.zeros(8), SENSOR)
+    follows = follow_distance(images, distance_m, 1)
+    assert follows.tolist() == [[True] * 3 + [False] * 5] * 3
+    seen_m = np.concatenate([ranges[0, :3] + 0.03, [1.5], np.full(4, wall_m)])
+    seen = Observation(seen_m[None], np.full((1, 8), 1e6), may[:1], ~may[:1])
+    group, own = (images, seen, np.zeros(1, np.int64)), np.zeros(1, np.int64)
+    assert best_moves(group, follows, own, 0.1) == pytest.approx(0.03, abs=1e-6)
+    assert best_moves(group, follows, own, 0.02) == 0
+    # the edge is off by half a metre, which costs no more than a disagreement
+    assert moved_costs(group, follows, own, np.array([0.03]), 0.0) == pytest.approx(25, abs=0.01)
+    assert moved_costs(group, follows, own, np.zeros(1), 0.0) == 100
+    assert moved_costs(group, follows, own, np.zeros(1), 0.03) == pytest.approx(3 * 0.03**2 / (1e-6 + 0.03**2) + 25)
+
+
+def test_a_landmark_whose_noise_is_far_below_a_step_of_the_grid_is_still_one(bank):
+    rng = np.random.default_rng(7)
+    distance_m, delta_rad = np.array([0.69, 0.71, 0.73]), np.radians([11.0, 13.0, 15.0])
+    image = Renderer(bank.mesh("gear"), SENSOR).render(distance_m, delta_rad)
+    matches = Matcher(bank, "nearest").match(kalman_filter(capture(image, SENSOR, rng=rng, n_frames=50)))
+    assert list(matches.class_name) == ["gear"] * 3
+    assert np.abs(matches.distance_m - distance_m) == pytest.approx(0.01, abs=1e-6)
+    assert all(one.class_probability["gear"] > 0.99 for one in matches)
 
 
 def test_an_end_of_the_angles_may_be_a_minimum_unless_they_close():

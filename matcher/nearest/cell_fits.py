@@ -1,9 +1,10 @@
 """Fits of frames to the views between the points of a bank's grid.
 
 About a grid point the range of a pixel changes linearly with distance and angle, by half of what it changes from one
-neighbour to the other. The position in the cell is fitted, at most 0.6 of a step to either side, and what a linear
-change leaves over half a step counts as an error of its own. A pixel whose return the grid point and all its neighbours
-contradict costs :data:`DISAGREEMENT`; one of which some may return and others not says nothing.
+neighbour to the other. The position is fitted, at most one step to either side, and what a linear change leaves over
+half a step counts as an error of its own. A pixel whose return the grid point and all its neighbours contradict costs
+:data:`DISAGREEMENT`; a return that some of them may show and others not says nothing, but among fits costs one, as a
+pixel does on average.
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.nearest.templates import Observation, Templates
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS
+from phasemark.render.phasor_images import wrap_difference_m
 
-__all__ = ["CellFits", "Group", "fit_cells", "moved_costs"]
+__all__ = ["CellFits", "Group", "best_moves", "fit_cells", "follow_distance", "moved_costs"]
 
-_REACH = 0.6
+_REACH = 1.0
 """Steps of the grid to either side that a fit may move."""
-_SUMS = 8
+_RISES_BY = 0.8
+"""By how much of it the range of a pixel that follows the distance changes more or less than that."""
+_SUMS = 9
 
 
 Group = tuple[Templates, Observation, NDArray[np.int64]]
@@ -31,10 +35,11 @@ Group = tuple[Templates, Observation, NDArray[np.int64]]
 
 
 class CellFits(NamedTuple):
-    """χ² of the best position in each of m cells, and its degrees of freedom; (m,) each."""
+    """χ² of the best position in each of m cells, its degrees of freedom, and what to compare fits by; (m,) each."""
 
     chi2: NDArray[np.float64]
     dof: NDArray[np.int64]
+    cost: NDArray[np.float64]
 
 
 def fit_cells(groups: Sequence[Group], frame: NDArray[np.int64]) -> CellFits:
@@ -53,36 +58,89 @@ def fit_cells(groups: Sequence[Group], frame: NDArray[np.int64]) -> CellFits:
         images = templates.range_m, templates.may_return, templates.must_return
         frames = templates.about(seen), seen.weight, seen.returned, seen.not_returned
         _add(sums, *images, *frames, frame, cells, templates.sensor.unambiguous_range_m)
-    dd, da, aa, d, a, left, n_compared, n_disagree = np.moveaxis(sums, -1, 0)
+    dd, da, aa, d, a, left, n_compared, n_disagree, n_undecided = np.moveaxis(sums, -1, 0)
     determinant, trace = dd * aa - da**2, dd + aa
     # what the pixels do not tell stays 0: the least solution of the normal equations
     is_full = determinant > 1e-12 * trace**2
     over = np.where(is_full, determinant, np.maximum(trace**2, math.ulp(0.0)))
     by_distance = np.where(is_full, aa * d - da * a, dd * d + da * a) / over
     by_angle = np.where(is_full, dd * a - da * d, da * d + aa * a) / over
-    may_move = n_compared >= MIN_RETURNS
-    x, y = (np.clip(offset, -_REACH, _REACH) * may_move for offset in (by_distance, by_angle))
-    chi2 = left - 2 * (x * d + y * a) + dd * x**2 + 2 * da * x * y + aa * y**2 + DISAGREEMENT * n_disagree
-    return CellFits(np.maximum(chi2, 0.0), np.maximum(n_compared + n_disagree - 2, 0).astype(np.int64))
+    places = n_compared >= MIN_RETURNS
+    x, y = (np.clip(offset, -_REACH, _REACH) for offset in (by_distance, by_angle))
+    residual = np.maximum(left - 2 * (x * d + y * a) + dd * x**2 + 2 * da * x * y + aa * y**2, 0.0)
+    n = n_compared + n_disagree
+    chi2 = np.where(places, residual, DISAGREEMENT * n_compared) + DISAGREEMENT * n_disagree
+    cost = chi2 + np.where(places, 1.0, DISAGREEMENT) * n_undecided
+    return CellFits(chi2, np.maximum(n - 2, 0).astype(np.int64), cost)
 
 
-def moved_costs(group: Group, frame: NDArray[np.int64], reach_m: float) -> tuple[NDArray[np.float64], ...]:
-    """Return what frames cost at templates whose ranges move by what fits best, `reach_m` at most, and that; (m,) each.
+def follow_distance(templates: Templates, distance_m: NDArray[np.float64], angles: int) -> NDArray[np.bool_]:
+    """Return which pixels of templates have a range that grows as the distance does, (t, pixels).
+
+    A wall behind the landmark does not, nor do pixels at the landmark's edges that see both.
+
+    Parameters
+    ----------
+    templates : Templates
+        Of classes at distances at angles, in this order.
+    distance_m : (n,) float64
+        Of the grid.
+    angles : int
+        How many.
+    """
+    n = len(distance_m)
+    shape = -1, n, angles, templates.range_m.shape[1]
+    range_m, may_return = templates.range_m.reshape(shape), templates.may_return.reshape(shape)
+    follows = np.empty_like(may_return)
+    for i in range(n):
+        near, far = max(i - 1, 0), min(i + 1, n - 1)
+        rise_m = wrap_difference_m(range_m[:, far] - range_m[:, near], templates.sensor)
+        apart_m = distance_m[far] - distance_m[near]
+        follows[:, i] = may_return[:, i] & (np.abs(rise_m - apart_m) <= _RISES_BY * apart_m)
+    return follows.reshape(templates.may_return.shape)
+
+
+def best_moves(group: Group, follows: NDArray[np.bool_], frame: NDArray[np.int64], off_m: float) -> NDArray[np.float64]:
+    """Return by how much the ranges of templates have to move to fit frames best; (m,).
 
     Parameters
     ----------
     group : (templates, frames, index)
         Index of templates, (m,).
+    follows : (t, pixels) bool
+        Pixels of templates that move, see :func:`follow_distance`.
     frame : (m,) int64
         Which of the frames.
-    reach_m : float
+    off_m : float
+        Pixels that are farther off say nothing.
     """
     templates, seen, index = group
-    cost, moved_m = np.empty(len(index)), np.empty(len(index))
-    images = templates.range_m, templates.may_return, templates.must_return
-    frames = templates.about(seen), seen.weight, DISAGREEMENT * seen.returned, DISAGREEMENT * seen.not_returned
-    _move(cost, moved_m, *images, *frames, frame, index, reach_m, templates.sensor.unambiguous_range_m)
-    return cost, moved_m
+    moved_m = np.empty(len(index))
+    period = templates.sensor.unambiguous_range_m
+    _move(moved_m, templates.range_m, follows, templates.about(seen), seen.weight, frame, index, off_m, period)
+    return moved_m
+
+
+def moved_costs(
+    group: Group, follows: NDArray[np.bool_], frame: NDArray[np.int64], moved_m: NDArray[np.float64], off_m: float
+) -> NDArray[np.float64]:
+    """Return what frames cost at templates whose ranges move, a pixel :data:`DISAGREEMENT` at most; (m,).
+
+    Parameters
+    ----------
+    group, follows, frame
+        As in :func:`best_moves`.
+    moved_m : (m,) float64
+    off_m : float
+        Standard deviation of an error of ranges besides that of the frames.
+    """
+    templates, seen, index = group
+    cost = np.empty(len(index))
+    images = templates.range_m, templates.may_return, templates.must_return, follows
+    weight = seen.weight / (1 + seen.weight * off_m**2)
+    frames = templates.about(seen), weight, DISAGREEMENT * seen.returned, DISAGREEMENT * seen.not_returned
+    _add_moved(cost, *images, *frames, frame, index, moved_m, templates.sensor.unambiguous_range_m)
+    return cost
 
 
 @njit(cache=True, nogil=True)
@@ -101,23 +159,34 @@ def _beside(before, behind, is_first, is_last, period):  # type: ignore[no-untyp
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
-def _move(cost, moved_m, range_m, may, must, about, weight, lost, absent, frame, index, reach_m, period):  # type: ignore[no-untyped-def]
-    """Fill the costs of frames at templates whose ranges move by what fits best, and by how much they move."""
+def _move(moved_m, range_m, follows, about, weight, frame, index, off_m, period):  # type: ignore[no-untyped-def]
+    """Fill by how much templates move; without branches, so that several pixels are done at once."""
     for k in range(len(frame)):
         f, at = frame[k], index[k]
-        total, along, weights = 0.0, 0.0, 0.0
+        along, weights = 0.0, 0.0
         for p in range(about.shape[1]):
-            residual = about[f, p] - range_m[at, p]
-            residual = residual - period if residual > period / 2 else residual
-            residual = residual + period if residual < -period / 2 else residual
-            w = weight[f, p] if may[at, p] else 0.0
+            off = about[f, p] - range_m[at, p]
+            off = off - period if off > period / 2 else off
+            off = off + period if off < -period / 2 else off
+            w = weight[f, p] if follows[at, p] & (abs(off) <= off_m) else 0.0
             weights += w
-            along += w * residual
-            total += w * residual * residual
-            total += 0.0 if may[at, p] else lost[f, p]
+            along += w * off
+        moved_m[k] = along / max(weights, 1e-300)
+
+
+@njit(cache=True, nogil=True, fastmath={"reassoc", "contract", "nsz"})
+def _add_moved(cost, range_m, may, must, follows, about, weight, lost, absent, frame, index, moved_m, period):  # type: ignore[no-untyped-def]
+    """Fill the costs at templates that have moved."""
+    for k in range(len(frame)):
+        f, at, moved = frame[k], index[k], moved_m[k]
+        total = 0.0
+        for p in range(about.shape[1]):
+            off = about[f, p] - range_m[at, p] - (moved if follows[at, p] else 0.0)
+            off = off - period if off > period / 2 else off
+            off = off + period if off < -period / 2 else off
+            total += min(weight[f, p] * off * off, DISAGREEMENT) if may[at, p] else lost[f, p]
             total += absent[f, p] if must[at, p] else 0.0
-        moved = min(max(along / max(weights, 1e-300), -reach_m), reach_m)
-        cost[k], moved_m[k] = total + moved * (moved * weights - 2 * along), moved
+        cost[k] = total
 
 
 @njit(cache=True, nogil=True)
@@ -135,7 +204,7 @@ def _add(sums, range_m, may, must, about, weight, returned, absent, frame, cells
             every = may[at, p] and may[near, p] and may[far, p] and may[left, p] and may[right, p]
             if not every:
                 some = may[at, p] or may[near, p] or may[far, p] or may[left, p] or may[right, p]
-                sums[k, 7] += not some
+                sums[k, 8 if some else 7] += 1
                 continue
             here = np.float64(range_m[at, p])
             to_near, to_far = _beside(range_m[near, p] - here, range_m[far, p] - here, at == near, at == far, period)

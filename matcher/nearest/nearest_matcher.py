@@ -6,7 +6,8 @@ The lower pixels give distance and angle, then the upper pixels give the class, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, phases_wrap
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, TOLERATED_SIGMA, Candidate, Match, Reason
-from phasemark.matcher.nearest.cell_fits import CellFits, fit_cells, moved_costs
+from phasemark.matcher.nearest.cell_fits import CellFits, Group, best_moves, fit_cells, follow_distance, moved_costs
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
@@ -32,22 +33,32 @@ _STEPS = 4
 """How often the distance that fits best at an angle is corrected: ranges change with it about as it does itself."""
 _APART_RAD = math.radians(2.0)
 """Spacing of the angles at which rivals of the nearest image are looked for."""
+_FACTOR = 8.0
+"""What a rival costs at most about its grid point, over what the answer does: the fit in its cell tells more."""
 _Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The nearest template of every class: (n, classes) arrays.
+    """The nearest template of every class: (n, classes) arrays, and which class fits best, (n,).
 
-    `i` and `j` index distance and angle, `cost` is the distance from the frame.
+    `i` and `j` index distance and angle, `chi2`, `dof` and `cost` are of the fit in the template's cell: a grid that is
+    coarse against the noise has no image near a frame.
     """
 
     i: NDArray[np.int64]
     j: NDArray[np.int64]
+    chi2: NDArray[np.float64]
+    dof: NDArray[np.int64]
     cost: NDArray[np.float64]
+    best: NDArray[np.int64]
 
-    def __getitem__(self, index: _Index) -> _Found:
-        return _Found(self.i[index], self.j[index], self.cost[index])
+    def __getitem__(self, index: _Index | int) -> _Found:
+        return _Found(*(getattr(self, one.name)[index] for one in fields(self)))
+
+    def of_best(self, values: NDArray[Any]) -> NDArray[Any]:
+        """Return the values, (n, classes), of the class that fits best."""
+        return values[np.arange(len(self.best)), self.best]
 
 
 class NearestMatcher:
@@ -74,6 +85,9 @@ class NearestMatcher:
         self._tolerance_m, self._tolerance_rad = tolerance_m, tolerance_rad
         self._false_alarm = false_alarm
         self._step_m = float(np.diff(bank.distance_m).max(initial=0.0))
+        radii = [np.linalg.norm(bank.mesh(name).vertices[:, :2], axis=1).max() for name in bank.classes]
+        self._size_m = 2 * float(max(radii))
+        self._turned_m = float(max(radii)) * float(np.diff(bank.delta_rad).max(initial=0.0)) / 2
         self._closes = closing_period(bank.delta_rad) is not None
         self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
@@ -82,6 +96,8 @@ class NearestMatcher:
         self._pose_rows = (0, bank.sensor.rows) if bank.full is not None else bank.sensor.lower_rows
         self.pose = self._templates(whole, self._pose_rows)
         self._class = None if bank.upper is None else self._templates(bank.upper, bank.sensor.upper_rows)
+        self._pose_follows = follow_distance(self.pose, bank.distance_m, len(bank.delta_rad))
+        self._class_follows = None if self._class is None else follow_distance(self._class, bank.distance_m, 1)
         self.search = nearest_search(
             self.pose, bank.distance_m, bank.delta_rad, before_background=background is not None
         )
@@ -105,13 +121,12 @@ class NearestMatcher:
         seen = Observation.from_frames(frames, (0, self._bank.sensor.rows))
         none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
         enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
-        chi2, dof = self._goodness(pose_seen, class_seen, found)
-        p_value = p_values_of(chi2, dof, noise_tails(frames))
+        p_value = p_values_of(found.of_best(found.chi2), found.of_best(found.dof), noise_tails(frames))
         ambiguous = np.zeros(len(frames), np.bool_)
         good = np.flatnonzero(enough & (p_value >= self._false_alarm))
         if good.size:
             its_class = None if class_seen is None else class_seen[good]
-            ambiguous[good] = self._have_rivals(frames[good], pose_seen[good], its_class, found[good], chi2[good])
+            ambiguous[good] = self._have_rivals(frames[good], pose_seen[good], its_class, found[good])
         nothing = Match(
             class_name=None,
             accepted=False,
@@ -119,11 +134,7 @@ class NearestMatcher:
             reason="no landmark",
         )
         return [
-            self._answer(
-                found, k, float(none_cost[k]), float(chi2[k]), int(dof[k]), float(p_value[k]), bool(ambiguous[k])
-            )
-            if enough[k]
-            else nothing
+            self._answer(found[k], float(none_cost[k]), float(p_value[k]), bool(ambiguous[k])) if enough[k] else nothing
             for k in range(len(frames))
         ]
 
@@ -131,14 +142,13 @@ class NearestMatcher:
         """Find the nearest image of each class; in a factored bank the nearest lower one, and the upper ones there."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
         blocks = range(n_class if class_seen is None else 1)
-        nearest = [self.search.nearest(pose_seen, c) for c in blocks]
-        best = np.stack([found for found, _ in nearest], axis=1) - np.asarray(blocks) * n_distance * n_delta
-        (i, j), cost = np.divmod(best, n_delta), np.stack([cost for _, cost in nearest], axis=1)
-        if class_seen is not None:
-            assert self._class is not None
-            cost = cost + self._class.costs_of_each(class_seen, np.arange(n_class) * n_distance + i)
-            i, j = np.repeat(i, n_class, axis=1), np.repeat(j, n_class, axis=1)
-        return _Found(i, j, cost)
+        nearest = [self.search.nearest(pose_seen, c)[0] for c in blocks]
+        best = np.stack(nearest, axis=1) - np.asarray(blocks) * n_distance * n_delta
+        i, j = np.divmod(np.broadcast_to(best, (len(best), n_class)), n_delta)
+        frame, c = (index.ravel() for index in np.indices(i.shape))
+        fits = self._cells(pose_seen, class_seen, frame, c, i.ravel(), j.ravel())
+        cost = fits.cost.reshape(i.shape)
+        return _Found(i, j, fits.chi2.reshape(i.shape), fits.dof.reshape(i.shape), cost, np.argmin(cost, axis=1))
 
     def _nothing(self) -> Templates:
         """Return the one template of a scene without a landmark."""
@@ -153,39 +163,38 @@ class NearestMatcher:
         pose_seen: Observation,
         class_seen: Observation | None,
         found: _Found,
-        chi2: NDArray[np.float64],
     ) -> NDArray[np.bool_]:
         """Return which frames a view beyond the tolerance, or of another class, explains about as well.
 
         At every angle the distance that fits best is asked: a flat valley along δ has no minimum of its own.
         """
-        n, columns = len(frames), self._columns()
-        frame, j = np.repeat(np.arange(n), len(columns)), np.tile(columns, n)
-        best = np.argmin(found.cost, axis=1)
-        best_i, best_j, best_cost = (values[np.arange(n), best][frame] for values in (found.i, found.j, found.cost))
-        # the cost of a grid point tells roughly what a frame costs in its cell
-        limit = 8.0 * (best_cost + DISAGREEMENT)
+        n, best, best_cost = len(frames), found.best, found.of_best(found.cost)
+        # the cost about a grid point tells roughly what a frame costs in its cell
+        limit = _FACTOR * (self._costs_of_best(pose_seen, class_seen, found) + DISAGREEMENT)
         rivalled = np.zeros(n, np.bool_)
         for c in range(len(self._bank.classes)):
             if c == 0 or class_seen is None:
+                columns = self._columns(c)
+                frame, j = np.repeat(np.arange(n), len(columns)), np.tile(columns, n)
+                best_i, best_j = (found.of_best(values)[frame] for values in (found.i, found.j))
                 i, cost = self._best_distances(pose_seen, frame, c, found.i[:, c], j)
             is_other = (best[frame] != c) | self._far(c, i, j, best_i, best_j)
-            asked = np.flatnonzero(is_other & (cost < limit))
+            asked = np.flatnonzero(is_other & (cost < limit[frame]))
             if class_seen is not None:
-                assert self._class is not None
-                of_class = self._class, class_seen, c * len(self._bank.distance_m) + i[asked]
-                cost_of_class, _ = moved_costs(of_class, frame[asked], self._step_m)
-                asked = asked[cost[asked] + cost_of_class < limit[asked]]
+                cost_of_class = self._class_costs(class_seen, frame[asked], c, i[asked])
+                asked = asked[cost[asked] + cost_of_class < limit[frame[asked]]]
             if not asked.size:
                 continue
             own = frame[asked]
-            theirs, dof = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
+            theirs = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
             along_delta = np.where(is_other, np.inf, -np.inf)
-            along_delta[asked] = theirs
+            along_delta[asked] = theirs.cost
             is_minimum = _is_minimum(along_delta.reshape(n, len(columns)), closes=self._closes).ravel()[asked]
-            as_good = theirs < chi2[own] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
+            as_good = theirs.cost < best_cost[own] + np.where(is_minimum, DISAGREEMENT, TOLERATED_SIGMA**2)
             # a minimum that would be accepted itself, too
-            as_good |= is_minimum & (p_values_of(theirs, dof, noise_tails(frames[own])) >= self._false_alarm)
+            as_good |= is_minimum & (
+                p_values_of(theirs.chi2, theirs.dof, noise_tails(frames[own])) >= self._false_alarm
+            )
             rivalled[own[as_good]] = True
         return rivalled
 
@@ -195,20 +204,42 @@ class NearestMatcher:
         """Return which distances fit frames best at angles, and what they cost about there; (m,) each."""
         distance_m, n_delta = self._bank.distance_m, len(self._bank.delta_rad)
         between = (distance_m[1:] + distance_m[:-1]) / 2
-        i = start[frame]
-        for _ in range(_STEPS):
-            at = (block * len(distance_m) + i) * n_delta + j
-            _, moved_m = moved_costs((self.pose, seen, at), frame, math.inf)
+        i, first = start[frame], block * len(distance_m)
+        for step in range(_STEPS):
+            group = self.pose, seen, (first + i) * n_delta + j
+            moved_m = best_moves(group, self._pose_follows, frame, self._size_m / 2**step)
             i = np.searchsorted(between, distance_m[i] + moved_m)
-        at = (block * len(distance_m) + i) * n_delta + j
-        cost, _ = moved_costs((self.pose, seen, at), frame, self._step_m)
-        return i, cost
+        return i, self._costs_about((self.pose, seen, (first + i) * n_delta + j), self._pose_follows, frame)
 
-    def _columns(self) -> _Index:
-        """Return which angles of the grid are asked for rivals."""
+    def _costs_about(self, group: Group, follows: NDArray[np.bool_], frame: _Index) -> NDArray[np.float64]:
+        """Return what frames cost about points of the grid, at the best distance there; (m,)."""
+        moved_m = best_moves(group, follows, frame, self._size_m).clip(-self._step_m, self._step_m)
+        return moved_costs(group, follows, frame, moved_m, self._turned_m)
+
+    def _class_costs(self, class_seen: Observation, frame: _Index, c: int | _Index, i: _Index) -> NDArray[np.float64]:
+        """Return what the upper pixels cost about distances of the grid; (m,)."""
+        assert self._class is not None
+        assert self._class_follows is not None
+        group = self._class, class_seen, c * len(self._bank.distance_m) + i
+        return self._costs_about(group, self._class_follows, frame)
+
+    def _costs_of_best(
+        self, pose_seen: Observation, class_seen: Observation | None, found: _Found
+    ) -> NDArray[np.float64]:
+        """Return what frames cost about their best grid points, (n,)."""
+        n, c, i = np.arange(len(found.best)), found.best, found.of_best(found.i)
+        first = 0 if class_seen is not None else c * len(self._bank.distance_m)
+        at = (first + i) * len(self._bank.delta_rad) + found.of_best(found.j)
+        cost = self._costs_about((self.pose, pose_seen, at), self._pose_follows, n)
+        return cost if class_seen is None else cost + self._class_costs(class_seen, n, c, i)
+
+    def _columns(self, class_index: int) -> _Index:
+        """Return which angles of the grid are asked for rivals: over a period of the class, or of the lower part."""
         delta_rad = self._bank.delta_rad
+        symmetry = self._symmetry[self._bank.classes[class_index]] if self._class is None else 1
+        n = np.searchsorted(delta_rad, delta_rad[0] + delta_period_rad(symmetry) - 1e-9)
         step = np.diff(delta_rad).min(initial=_APART_RAD)
-        return np.arange(0, len(delta_rad), max(int(_APART_RAD / step + 1e-9), 1))
+        return np.arange(0, max(n, 1), max(int(_APART_RAD / step + 1e-9), 1))
 
     def _far(self, class_index: int, i: _Index, j: _Index, of_i: _Index, of_j: _Index) -> NDArray[np.bool_]:
         """Return which views of the grid are beyond the tolerance, and more than a cell, from others."""
@@ -219,17 +250,15 @@ class NearestMatcher:
         far_along = (along > self._tolerance_m) & (np.abs(i - of_i) > 1)
         return np.asarray(far_along | ((around > self._tolerance_rad) & (np.abs(j - of_j) > 1)))
 
-    def _answer(
-        self, found: _Found, k: int, none_cost: float, chi2: float, dof: int, p_value: float, ambiguous: bool
-    ) -> Match:
+    def _answer(self, found: _Found, none_cost: float, p_value: float, ambiguous: bool) -> Match:
         """Turn what was found for one frame into an answer."""
-        order = np.argsort(found.cost[k], kind="stable")
+        order = np.argsort(found.cost, kind="stable")
         candidates = tuple(
             Candidate(
                 self._bank.classes[c],
-                float(self._bank.distance_m[found.i[k, c]]),
-                float(self._bank.delta_rad[found.j[k, c]]),
-                float(found.cost[k, c]),
+                float(self._bank.distance_m[found.i[c]]),
+                float(self._bank.delta_rad[found.j[c]]),
+                float(found.cost[c]),
             )
             for c in order
         )
@@ -245,10 +274,10 @@ class NearestMatcher:
             accepted=not reason,
             distance_m=best.distance_m,
             delta_rad=best.delta_rad,
-            chi2=chi2,
-            dof=dof,
+            chi2=float(found.chi2[found.best]),
+            dof=int(found.dof[found.best]),
             p_value=p_value,
-            class_probability=self._probabilities(found.cost[k], none_cost),
+            class_probability=self._probabilities(found.cost, none_cost),
             alternatives=candidates[1:] if is_landmark else candidates,
             symmetry=self._symmetry[best.class_name],
             reason=reason,
@@ -264,11 +293,6 @@ class NearestMatcher:
         values[: len(cost)], values[-1] = cost, none_cost
         weight = np.exp(-0.5 * (values - values.min()))
         return dict(zip(names, (weight / weight.sum()).tolist(), strict=True))
-
-    def _goodness(self, pose_seen: Observation, class_seen: Observation | None, found: _Found) -> CellFits:
-        """Return χ² and degrees of freedom of the best images, the linear change in a cell taken out; (n,) each."""
-        frame, c = np.arange(len(found.cost)), np.argmin(found.cost, axis=1)
-        return self._cells(pose_seen, class_seen, frame, c, found.i[frame, c], found.j[frame, c])
 
     def _cells(
         self,
