@@ -51,7 +51,8 @@ class FakeBoard:
                     return
             try:
                 self._connection.sendall(line)
-            except OSError:
+            except OSError:  # the reader is gone; another may come
+                self._connection.close()
                 self._connection = None
 
         self._start(send)
