@@ -12,11 +12,14 @@ from builders import strangers
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
+from phasemark.data.commands.options import FrameReading
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
-from phasemark.matcher.diagnosis import Diagnosis
+from phasemark.matcher.commands.diagnosis_flags import diagnosis_text
+from phasemark.matcher.diagnosis import Change, Diagnosis
 from phasemark.matcher.diagnosis.search import _Seen
+from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.match import Candidate, Match
 from phasemark.render import Background, Frames, Renderer, capture, preset
@@ -160,6 +163,30 @@ def test_a_thing_beside_the_landmark_is_diagnosed_as_unknown(banks):
     assert found.match.distance_m == pytest.approx(CONE_VIEW[0], abs=5e-3)
 
 
+def test_a_landmark_that_fits_among_missing_pixels_is_diagnosed_with_what_they_mean(banks):
+    frames = frames_of("pmd-16x16", *CONE_VIEW)
+    dark = frames.state == PixelState.NO_RETURN
+    missing = replace(frames, state=np.where(dark, PixelState.MISSING, frames.state).astype(np.uint8))
+    matcher = Matcher(banks["pmd-16x16"], "refine", background="unknown")
+    found = diagnose(matcher, missing, seconds=math.inf)
+    assert [(change.parameter, change.value) for change in found.changes] == [("invalid_means", "no-return")]
+    assert found.match.distance_m == pytest.approx(CONE_VIEW[0], abs=5e-3)
+    assert str(found).endswith("it fits with invalid pixels taken for no returns: invalid_means='no-return'")
+
+
+def test_a_landmark_whose_surface_goes_on_beside_it_is_said_to_fit_and_not_to_end(banks):
+    frames = frames_of("pmd-16x16", *CONE_VIEW)
+    for row in range(frames.sensor.rows):
+        seen = np.flatnonzero(frames.state[0, row] == PixelState.RETURN)
+        for name in ARRAYS if seen.size else ():
+            values = getattr(frames, name)[0, row]
+            values[: seen[0]], values[seen[-1] + 1 :] = values[seen[0]], values[seen[-1]]
+    matcher = Matcher(banks["pmd-16x16"], "refine", background="unknown")
+    found = diagnose(matcher, frames, seconds=math.inf)
+    assert found.changes == ()
+    assert "cone fits, but the pixels beside it do not show where it ends" in str(found)
+
+
 @pytest.mark.parametrize(
     ("name", "shape"), [(PRESETS[0], "cube"), pytest.param(PRESETS[1], "slab", marks=pytest.mark.soak)]
 )
@@ -220,6 +247,16 @@ def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_
     done = capsys.readouterr()
     assert done.err == ""
     assert "diagnosis" not in json.loads(done.out)["matches"][0]
+
+
+@pytest.mark.parametrize(
+    ("option", "told"), [("missing", "--invalid-means no-return"), ("no-return", "frames that flag them so")]
+)
+def test_the_command_names_what_invalid_pixels_mean(option, told):
+    change = Change("invalid_means", "no-return", "invalid pixels taken for no returns")
+    refused = Match("cone", False, 1.0, 0.5, chi2=3.0, dof=20, reason="poor fit")
+    found = Diagnosis(0, refused, (change,), n_returned=9)
+    assert diagnosis_text(found, FrameReading(invalid_means=option), False, False).endswith(f"no returns: {told}")
 
 
 def test_a_diagnosis_that_fails_loses_no_answer(tmp_path, capsys, monkeypatch):

@@ -307,6 +307,21 @@ def test_states_tell_return_no_return_and_missing_apart(run):
     np.testing.assert_allclose(filtered.amplitude_e[0, 0], [5000, 5000, 5000, 10, 5000, 10, np.nan])
 
 
+@pytest.mark.parametrize("run", [kalman_filter, one_at_a_time, phasor_mean])
+@pytest.mark.parametrize(("n_valid", "state"), [(3, PixelState.MISSING), (4, PixelState.RETURN)])
+def test_a_pixel_that_is_missing_in_most_frames_is_missing(run, n_valid, state):
+    # a chip that reports no target leaves open why; the few it reports there are noise above its threshold
+    flags = np.zeros((1, 15, 1, 2), np.uint8)
+    flags[:, n_valid:, :, 1] = Flag.MISSING
+    values = np.full(flags.shape, 2.0)
+    filtered = run(Frames(values, 2500 * values, 1e4 * values, sensor=sensor_of(1, 2), flags=flags))
+    assert filtered.state[0, 0].tolist() == [PixelState.RETURN, state]
+    # frames that are lost as a whole leave all pixels as they are
+    flags[:, n_valid:] = Flag.MISSING
+    filtered = run(Frames(values, 2500 * values, 1e4 * values, sensor=sensor_of(1, 2), flags=flags))
+    assert filtered.state[0, 0].tolist() == [PixelState.RETURN, PixelState.RETURN]
+
+
 @pytest.mark.parametrize("run", [kalman_filter, one_at_a_time])
 @pytest.mark.parametrize("process_var_m2", [0.0, 1e-4])
 def test_a_camera_without_noise_is_filtered_without_complaint(run, process_var_m2):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 _IN_FLAGS = {
     "on": "{refine}--on {0}",
     "quantity": "--quantity {0}",
+    "invalid_means": "--invalid-means {0}",
     "half_angle_deg": "a bank of a sensor file with half_angle_h_deg = {0[0]:.4g}, half_angle_v_deg = {0[1]:.4g}"
     " (phasemark calibrate makes one)",
     "bearing_offset_deg": "a bank of a sensor file with bearing_offset_deg = {0:.3g}, or the camera turned",
@@ -54,6 +55,8 @@ def _flags(change: Change, reading: FrameReading, nearest: bool, bearing_fixed: 
     if change.parameter == "rotate":
         angle = (reading.rotate + value) % 360
         return f"--rotate {angle}" if angle else "without --rotate"
+    if change.parameter == "invalid_means" and reading.invalid_means == value:
+        return "frames that flag them so"
     if change.parameter == "unit_factor":
         scale = None if reading.unit is None else METRES_PER_UNIT[reading.unit] * value
         right = next((name for name, metres in METRES_PER_UNIT.items() if scale and math.isclose(metres, scale)), None)

@@ -42,6 +42,7 @@ Parameter = Literal[
     "rotate",
     "quantity",
     "unit_factor",
+    "invalid_means",
     "half_angle_deg",
     "distance_m",
 ]
@@ -69,10 +70,10 @@ class Change:
     Parameters
     ----------
     parameter : str
-        "method", "on", "free" and "background" of :class:`~phasemark.matcher.Matcher`; "flip_h", "flip_v", "rotate" and
-        "quantity" of :func:`phasemark.data.read_frames`, applied after those given; "unit_factor", by which the ranges
-        are multiplied; "bearing_offset_deg" and "half_angle_deg" of the sensor the bank is built for; "distance_m",
-        which the bank does not reach.
+        "method", "on", "free" and "background" of :class:`~phasemark.matcher.Matcher`; "flip_h", "flip_v", "rotate",
+        "quantity" and "invalid_means" of :func:`phasemark.data.read_frames`, applied after those given;
+        "unit_factor", by which the ranges are multiplied; "bearing_offset_deg" and "half_angle_deg" of the sensor the
+        bank is built for; "distance_m", which the bank does not reach.
     value : object
         Its new value; of "half_angle_deg" both angles, horizontal and vertical.
     words : str
@@ -115,6 +116,8 @@ class Diagnosis:
         Whether time was up before every change was tried.
     among_unknown : bool
         Whether it was matched among unknown things, so that neither background nor field of view was changed.
+    does_not_stand_out : bool
+        Whether among unknown things the landmark fits, but the scene does not end at its outline.
     """
 
     index: int
@@ -125,6 +128,7 @@ class Diagnosis:
     n_returned: int = 0
     stopped: bool = False
     among_unknown: bool = False
+    does_not_stand_out: bool = False
 
     @property
     def enough_alone(self) -> bool:
@@ -145,6 +149,8 @@ class Diagnosis:
                 return f"{head}: {self.n_returned} of its pixels return, and {FEWEST_RETURNS} are needed"
             if self.refused.reason in ("undetermined", "ambiguous"):
                 return f"{head}: {self._what_is_open()}"
+            if self.does_not_stand_out:
+                return f"{head}: {self.refused.class_name} fits, but the pixels beside it do not show where it ends"
             if self.stopped:
                 return f"{head}: none of the changes tried makes it fit, and time was up before all were tried"
             also = "" if self.among_unknown else ", background, field of view"
@@ -215,7 +221,7 @@ def _remedy(change: Change) -> str:
     """Return what to do, with the names of the library."""
     value = change.value
     match change.parameter:
-        case "method" | "on" | "free" | "background" | "quantity":
+        case "method" | "on" | "free" | "background" | "quantity" | "invalid_means":
             return f"{change.parameter}={value!r}"
         case "flip_h" | "flip_v":
             return f"{change.parameter} the other way round"
@@ -275,7 +281,8 @@ def diagnose(
     Notes
     -----
     A change counts if its match is accepted, has at least three degrees of freedom and a chi2 that is lower than
-    before by a factor of 1.5 and by 40.
+    before by a factor of 1.5 and by 40. What invalid pixels mean need not lower chi2: it is tried where the landmark
+    fits, but what is beside it is missing.
 
     Of several modulation frequencies unwrapped ranges are compared, whatever the matcher compares.
     """
@@ -288,12 +295,13 @@ def diagnose(
         raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
     n_returned = int((frame.state == PixelState.RETURN).sum())
     among_unknown = matcher.options["background"] == "unknown" or matcher.options["on"] == "reported"
-    nothing = Diagnosis(index, refused, n_returned=n_returned, among_unknown=among_unknown)
+    fits = refused.reason == "poor fit" and refused.p_value >= matcher.false_alarm
+    nothing = Diagnosis(index, refused, n_returned=n_returned, among_unknown=among_unknown, does_not_stand_out=fits)
     end = time.monotonic() + seconds
     if n_returned < FEWEST_RETURNS or matcher.bank.plan.model != "ray":
         return nothing
     with ExitStack() as stack:
-        trials = _Trials(matcher, frame, background, refused, stack)
+        trials = _Trials(matcher, frame, background, nothing, stack)
         for found in trials.in_order():
             if found:
                 (changes, match), *others = found
@@ -311,7 +319,12 @@ class _Trials:
     """The changes tried on one frame, by matchers that have the settings of the one that refused it."""
 
     def __init__(
-        self, matcher: Matcher, frame: FilteredFrames, background: Background | None, refused: Match, stack: ExitStack
+        self,
+        matcher: Matcher,
+        frame: FilteredFrames,
+        background: Background | None,
+        so_far: Diagnosis,
+        stack: ExitStack,
     ) -> None:
         told = matcher.options
         self.nearest, self.stack = matcher.method == "nearest", stack
@@ -335,7 +348,8 @@ class _Trials:
         self.free = self.default or (VIEW if told["free"] is None else check_free(told["free"]))
         self.search = Search(self.bank)
         self.plain = self.matcher(self.free, self.background)
-        self.reference = self.plain.match(self.frame)[0] if self.nearest else refused
+        self.reference = self.plain.match(self.frame)[0] if self.nearest else so_far.refused
+        self.fits = so_far.does_not_stand_out
         self.bearing_free = "bearing_rad" in self.free and self.default is None
         self.with_bearing = check_free(tuple(dict.fromkeys((*self.free, "bearing_rad"))))
         self.stated = self._estimated() if isinstance(self.background, str) else self.background
@@ -353,6 +367,7 @@ class _Trials:
         if self.nearest and self.reference.accepted:
             yield [((_METHOD,), self.reference)]
         if self.background == "unknown":
+            yield self._without_missing()
             yield self._freed(("bearing_rad",))
             yield self._transformed()
             yield self._outside_among_unknown()
@@ -371,6 +386,16 @@ class _Trials:
         yield self._among_unknown()
         if not self.bearing_free and rough is None:
             yield self._transformed_with_bearing()
+
+    def _without_missing(self) -> _Found:
+        """Match the frame with missing pixels read as no returns, where the landmark fits but nothing shows its end."""
+        missing = self.frame.state == PixelState.MISSING
+        if not (self.fits and missing.any()):
+            return []
+        state = np.where(missing, PixelState.NO_RETURN, self.frame.state).astype(np.uint8)
+        match = self.plain.match(replace(self.frame, state=state, time_s=None))[0]
+        change = Change("invalid_means", "no-return", "invalid pixels taken for no returns")
+        return [((change,), match)] if match.accepted and match.dof >= FEWEST_DOF else []
 
     def _freed(self, names: Sequence[str]) -> _Found:
         """Match with more of the view free."""

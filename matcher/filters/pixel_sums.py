@@ -124,8 +124,13 @@ class PixelSums:
         n_effective: NDArray[np.float64],
         coherent_amplitude_e: NDArray[np.float64] | None = None,
     ) -> FilteredFrames:
-        """Return filtered frames of these ranges, (n, rows, cols), with state, amplitude and intensity."""
-        usable = self.n_usable > 0
+        """Return filtered frames of these ranges, (n, rows, cols), with state, amplitude and intensity.
+
+        A pixel that says something less than a quarter as often as the one that does most often is missing: the few
+        frames of it are those in which noise passed a threshold.
+        """
+        most = self.n_usable.max(axis=(1, 2), keepdims=True)
+        usable = (self.n_usable > 0) & (4 * self.n_usable >= most)
         returned = usable & (2 * self.n_valid >= self.n_usable)
         state = np.where(returned, PixelState.RETURN, np.where(usable, PixelState.NO_RETURN, PixelState.MISSING))
         amplitude_e = self.mean("amplitude_e")
