@@ -201,7 +201,10 @@ class NearestMatcher:
     def _best_distances(
         self, seen: Observation, frame: _Index, block: int, start: _Index, j: _Index
     ) -> tuple[_Index, NDArray[np.float64]]:
-        """Return which distances fit frames best at angles, and what they cost about there; (m,) each."""
+        """Return which distances fit frames best at angles, and what they cost about there; (m,) each.
+
+        Pixels that are farther off than the landmark is wide say nothing, and half of that in each step that follows.
+        """
         distance_m, n_delta = self._bank.distance_m, len(self._bank.delta_rad)
         between = (distance_m[1:] + distance_m[:-1]) / 2
         i, first = start[frame], block * len(distance_m)
