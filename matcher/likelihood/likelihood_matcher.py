@@ -363,7 +363,9 @@ class LikelihoodMatcher:
         for c in range(len(self._setup.rules.names)):
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).footprint, view)
 
-    def _cells(self, behind: PhasorImages | None, *, open_edges: bool = False, tilted: bool = False) -> CellBounds:
+    def _cells(
+        self, behind: PhasorImages | None, *, open_edges: bool = False, tilted: bool = False, workers: int = 1
+    ) -> CellBounds:
         """Return the cells of the bank before some background, for level or for tilted frames."""
         setup, bank = self._setup, self._bank
         return CellBounds(
@@ -374,6 +376,7 @@ class LikelihoodMatcher:
             upward=not setup.height_and_tilt_are_known or tilted,
             open_edges=open_edges,
             turned=self._turned if setup.bearing_is_free or tilted else None,
+            workers=workers,
         )
 
     @cached_property
@@ -385,7 +388,7 @@ class LikelihoodMatcher:
         """Return a search before some background, over all bearings that are looked for where they are free."""
         setup, layers = self._setup, layers_of(self._bank)
         return Search(
-            self._cells(behind, tilted=tilted),
+            self._cells(behind, tilted=tilted, workers=self._workers),
             self._bank.sensor if layers is None else layers.camera,
             layers,
             setup.widest_rad if setup.bearing_is_free else 0.0,

@@ -7,7 +7,6 @@ returns from these intervals, so that a cell whose bound is above a limit holds 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, seen_by_images
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
 from phasemark.render import PhasorImages
+from phasemark.render.threads import mapped
 
 _FAR_M = 1e6
 """The middle of the interval of a pixel in which nothing may return: any return disagrees with it."""
@@ -76,6 +76,8 @@ class CellBounds:
     turned : callable, optional
         Returns views at other bearings within half a column, for the centres of cells. Without it a column may show at
         those no more than it and its neighbours do, which is too little where columns are wide.
+    workers : int
+        Threads in which cells are made.
 
     Attributes
     ----------
@@ -97,6 +99,7 @@ class CellBounds:
         upward: bool = False,
         open_edges: bool = False,
         turned: Turned | None = None,
+        workers: int = 1,
     ) -> None:
         self.closes = closing_period(bank.delta_rad) is not None
         centres = (
@@ -113,7 +116,7 @@ class CellBounds:
                 continue
             rows = group_rows(name, bank.sensor)
             seen = _Seen(behind, rows, open_edges, aside, upward)
-            found = _cells_of_group(bank, group, centres, stride, self.closes, seen, turned)
+            found = _cells_of_group(bank, group, centres, stride, self.closes, seen, turned, workers)
             # pixels that differ most from cell to cell come first: a bound that grows early is given up early
             spread = [np.where(column < _FAR_M, column, 0).var() for column in found.middle_m.T]
             order = np.argsort(-np.array(spread), kind="stable")
@@ -200,6 +203,7 @@ def _cells_of_group(
     closes: bool,
     seen: _Seen,
     turned: Turned | None,
+    workers: int,
 ) -> Cells:
     """Return the cells of a group of a bank, (class, D, δ, pixels) with all but the pixels flattened."""
     has_class, has_delta = len(group.n_views) == 3 or seen.rows[0] == 0, group.n_views[-1] == len(bank.delta_rad)
@@ -213,8 +217,11 @@ def _cells_of_group(
     n_class, n_a = len(bank.classes) if has_class else 1, len(centres[1]) if has_delta else 1
     shape = n_class * len(centres[0]) * n_a, (seen.rows[1] - seen.rows[0]) * cols
     found = Cells(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-    for k, (c, i) in enumerate(itertools.product(range(n_class), centres[0])):
-        rows = slice(max(int(i) - reach, 0), min(int(i) + reach + 1, n_d))
+
+    def fill(k: int) -> None:
+        c, at = divmod(k, len(centres[0]))
+        i = int(centres[0][at])
+        rows = slice(max(i - reach, 0), min(i + reach + 1, n_d))
         part = group.part(*((slice(c, c + 1),) if has_class else ()), rows)
         there = _intervals(part.phasor, np.asarray(part.coverage), bank, rows.stop - rows.start, seen)
         cells = _hull(there, np.array([i - rows.start]), stride[0], 0, period_m)
@@ -233,6 +240,8 @@ def _cells_of_group(
             cells = _shifted(cells, cols, 0, period_m)
         place, packed = slice(k * n_a, (k + 1) * n_a), _packed(cells)
         found.middle_m[place], found.half_m[place], found.must_return[place] = packed
+
+    mapped(fill, range(n_class * len(centres[0])), workers)
     return found
 
 
