@@ -64,10 +64,8 @@ def _echo_estimate(plan: AnyPlan, size: Mapping[str, int], fits: bool, building:
     if fits and many is None:
         facts = estimate_build(plan, workers=building.workers or processors())
         about = f"about {facts['seconds']:.3g}"
-    if building.as_json:
-        echo_json({**facts, "seconds": facts.get("seconds")})
-    else:
-        echo_facts({**facts, "seconds": about})
+    seconds = facts.get("seconds") if building.as_json else about
+    echo_facts({**facts, "seconds": seconds}, as_json=building.as_json)
 
 
 def _note_large(plan: AnyPlan, out: Path, size: Mapping[str, int], parts: int, limit: int, building: Building) -> None:

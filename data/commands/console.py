@@ -90,8 +90,7 @@ def echo(*lines: object) -> None:
 def echo_facts(facts: Mapping[str, Any], *, as_json: bool = False) -> None:
     """Print one fact a line, names aligned; or all of them as JSON."""
     if as_json:
-        echo_json(facts)
-        return
+        return echo_json(facts)
     rows = []
     for key, value in facts.items():
         if isinstance(value, Mapping):

@@ -23,8 +23,7 @@ def landmark_list(*, as_json: Json = False) -> None:
 
     specs = catalog()
     if as_json:
-        echo_json([spec.model_dump(mode="json") for spec in specs.values()])
-        return
+        return echo_json([spec.model_dump(mode="json") for spec in specs.values()])
     rows = []
     for name, spec in specs.items():
         box = " × ".join(f"{side_m:g}" for side_m in (spec.box.length_m, spec.box.width_m, spec.box.height_m))
@@ -91,8 +90,7 @@ def landmark_check(file: Path, *, mesh_reading: MeshReading, as_json: Json = Fal
     _, mesh = read_landmark(str(file), mesh_reading)
     checked = check_mesh(mesh)
     if as_json:
-        echo_json({"file": str(file), **checked.as_dict()})
-        return
+        return echo_json({"file": str(file), **checked.as_dict()})
     report = checked.as_dict()
     del report["warnings"]  # reading the file has put them on stderr
     n = report["symmetry"]

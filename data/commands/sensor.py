@@ -33,8 +33,7 @@ def sensor_list(*, as_json: Json = False) -> None:
 
     sensors = {name: preset(name) for name in preset_names()}
     if as_json:
-        echo_json([{"name": name, **sensor.as_dict()} for name, sensor in sensors.items()])
-        return
+        return echo_json([{"name": name, **sensor.as_dict()} for name, sensor in sensors.items()])
     rows = []
     for name, sensor in sensors.items():
         angles = f"{2 * sensor.half_angle_v_deg:g}° × {2 * sensor.half_angle_h_deg:g}°"
@@ -80,8 +79,7 @@ def sensor_show(
     if picture is not None:
         _write_picture(sensor, picture, force)
     if as_json:
-        echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
-        return
+        return echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
     if sensor.kind == "direct":
         axis = "z, along the optical axis" if sensor.quantity == "z" else "the range along the ray"
         echo(f"# direct time of flight: no taps, no modulation; its own quantity is {axis}")
@@ -279,8 +277,7 @@ def sensor_fit(
     )  # fmt: skip
     write_file(out, fit.to_toml(base_name=readable(sensor)), force)
     if as_json:
-        echo_json({"file": str(out), **fit.as_dict()})
-        return
+        return echo_json({"file": str(out), **fit.as_dict()})
     fields = fit.sensor.model_dump(mode="json")
     echo_table(
         ("field", "value", "std error", "from"),

@@ -69,8 +69,7 @@ def sensor_fit_direct(
     squared = (fit.plane_range_m(recording) - recording.distance_m[:, None]) ** 2
     spread_mm = (1e3 * squared.mean(axis=0) ** 0.5).tolist()
     if as_json:
-        echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread_mm, "zone_orders": scores})
-        return
+        return echo_json({"file": str(out), **fit.as_dict(), "range_rms_mm": spread_mm, "zone_orders": scores})
     _echo_fit(fit, spread_mm)
     if scores:
         best, second = sorted(scores, key=lambda name: scores[name])[:2]

@@ -298,16 +298,11 @@ class Landmark:
         from phasemark.data.plans.bank_plan import MeshPlan
         from phasemark.landmarks import catalog
 
-        is_class = str(name) in catalog()
-        mesh = MeshPlan(name=name.stem, path=str(name), unit=unit, up=self.up, origin=self.origin)
-        plan = BankPlan(
-            sensor=camera_name,
-            distance_m=distance_m,
-            classes=(str(name),) if is_class else (),
-            landmarks=(),
-            meshes=() if is_class else (mesh,),
-            layout="factored" if is_class else "full",
-        ).resolve()
+        shown: dict[str, Any] = {"classes": (str(name),), "layout": "factored"}
+        if str(name) not in catalog():
+            mesh = MeshPlan(name=name.stem, path=str(name), unit=unit, up=self.up, origin=self.origin)
+            shown = {"meshes": (mesh,), "layout": "full"}
+        plan = BankPlan(sensor=camera_name, distance_m=distance_m, **shown).resolve()
         with LongWork("building a bank") as progress:
             return cached_bank(plan, keep=not self.no_cache, progress=progress)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from phasemark import UsageError
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import Table, echo, echo_json
+from phasemark.data.commands.console import echo, echo_json, echo_table
 from phasemark.data.commands.options import Count, Json
 
 if TYPE_CHECKING:
@@ -65,8 +65,7 @@ def pose_report(
     if as_json:
         return echo_json({"estimates": str(measured), "truth": str(truth), **report.as_dict()})
     lines = report.rows()
-    table = Table(list(lines[0]))
-    table.echo([list(line.values()) for line in lines])
+    echo_table(list(lines[0]), [list(line.values()) for line in lines])
     echo(f"{report.n_measured} of {report.n_poses} poses measured")
 
 
