@@ -16,6 +16,7 @@ from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.options import Count, Degrees, Force, Json, Metres, Out
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
+from phasemark.matcher import locate  # it imports what is used
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -86,25 +87,23 @@ def locate_rig(
         A figure of the poses in their maps, .png.
     """
     from phasemark.matcher.locate.figures import locate_figure
-    from phasemark.matcher.locate.locator import Locator
     from phasemark.matcher.locate.pose_table import pose_csv
-    from phasemark.matcher.locate.recording import read_rig_recording
-    from phasemark.matcher.locate.rig import read_rig
-    from phasemark.matcher.locate.wall_map import map_of_run, read_wall_map
+    from phasemark.matcher.locate.wall_map import map_of_run
 
     refuse_other_files(out, ".csv", "the table")
     if plot is not None:
         refuse_other_files(plot, ".png")
     refuse_existing([out] if plot is None else [out, plot], force)
-    rig, answers, drawn, robot_key = read_rig(rig_file), [], [], "robot"
+    rig, answers, drawn, robot_key = locate.read_rig(rig_file), [], [], "robot"
     std = (start_std, start_std, math.radians(start_yaw_std))
     with LongWork("locating"):
         for path in recordings:
-            recording = read_rig_recording(path, rig)
+            recording = locate.read_rig_recording(path, rig)
             recording = recording if frames is None else recording.first_frames(frames)
-            wall_map = read_wall_map(map_file, map_of_run(map_file, map_name or recording.map_name, recording.run))
+            name = map_of_run(map_file, map_name or recording.map_name, recording.run)
+            wall_map = locate.read_wall_map(map_file, name)
             limits = {"tolerance_m": tolerance, "tolerance_rad": math.radians(tolerance_yaw)}
-            locator = Locator(wall_map, rig, with_tilt=tilt, **limits)
+            locator = locate.Locator(wall_map, rig, with_tilt=tilt, **limits)
             found = _located(locator, recording, start, odometry, std, smooth)
             drawn.append((recording.run, locator.model.outline, found, None))
             answers += found
@@ -128,7 +127,6 @@ def _located(
 ) -> list[LocatedPose]:
     """Locate the stops of a recording from what is known beforehand."""
     from phasemark.matcher.locate.recording import poses_of, read_stop_poses
-    from phasemark.matcher.locate.smoothing import smoothed
 
     starts = None if start is None else poses_of(recording, read_stop_poses(start))
     if starts is not None and all(math.isnan(pose[0]) for pose in starts):
@@ -142,7 +140,7 @@ def _located(
         answers = locator.follow(recording, first, std)
     else:
         answers = locator.locate(recording, starts, std)
-    return smoothed(recording, answers, locator) if smooth else answers
+    return locate.smoothed(recording, answers, locator) if smooth else answers
 
 
 def _echo_summary(answers: Sequence[LocatedPose]) -> None:
@@ -181,16 +179,14 @@ def calibrate_rig_file(
     out
         The rig file to write, .toml; displaced walls go beside it.
     """
-    from phasemark.matcher.locate.recording import read_rig_recording
-    from phasemark.matcher.locate.rig import read_rig
     from phasemark.matcher.locate.rig_calibration import FREE, calibrate_rig
 
     if map_file is None:
         raise UsageError("--rig needs --map, the walls among which the recordings were made")
     refuse_other_files(out, ".toml", "the rig")
     refuse_existing([out], force)
-    rig = read_rig(rig_file)
-    read = [read_rig_recording(path, rig) for path in recordings]
+    rig = locate.read_rig(rig_file)
+    read = [locate.read_rig_recording(path, rig) for path in recordings]
     maps, names = _maps(map_file, read)
     moved_maps = names if "walls" in (free or ()) else {}
     plain = [re.sub(r"[^\w.-]", "_", name) for name in moved_maps]
@@ -214,10 +210,10 @@ def calibrate_rig_file(
 
 def _maps(map_file: Path, recordings: Sequence[RigRecording]) -> tuple[list[WallMap], dict[str, WallMap]]:
     """Return the map of each recording, and each map by its name."""
-    from phasemark.matcher.locate.wall_map import map_of_run, read_wall_map
+    from phasemark.matcher.locate.wall_map import map_of_run
 
     names = [map_of_run(map_file, recording.map_name, recording.run) for recording in recordings]
-    by_name = {name or "map": read_wall_map(map_file, name) for name in dict.fromkeys(names)}
+    by_name = {name or "map": locate.read_wall_map(map_file, name) for name in dict.fromkeys(names)}
     return [by_name[name or "map"] for name in names], by_name
 
 

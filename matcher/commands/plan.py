@@ -14,6 +14,7 @@ from phasemark.data.commands.console import LongWork, echo, echo_json, echo_tabl
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers
 from phasemark.data.commands.outputs import output_folder
+from phasemark.matcher import design, drive  # they import what is used
 
 PlanKind = Annotated[
     Literal["bank", "frames", "scenes", "sweep", "drive", "design"],
@@ -46,11 +47,10 @@ def plan_check(file: Path, *, kind: PlanKind | None = None, as_json: Json = Fals
         Kind of the plan, if it leaves it open.
     """
     from phasemark.data.plans.bank_plan import ScenePlan
-    from phasemark.matcher.drive import DrivePlan
     from phasemark.matcher.plan_kinds import check_plan
 
     found, plan = check_plan(file, kind)
-    if isinstance(plan, ScenePlan | DrivePlan):
+    if isinstance(plan, ScenePlan | drive.DrivePlan):
         note_plan_too_far(plan)
     if as_json:
         echo_json({"kind": found, "plan": plan.model_dump(mode="json")})
@@ -79,18 +79,16 @@ def drive_robot(
     example
         Print the plan of that tour, and do nothing else.
     """
-    from phasemark.matcher.drive import OUTPUTS, default_drive, example_drive, read_drive_plan, run_drive, write_drive
-
     if example:
-        return echo(example_drive().removesuffix("\n"))
-    plan = default_drive() if plan_file is None else read_drive_plan(plan_file)
+        return echo(drive.example_drive().removesuffix("\n"))
+    plan = drive.default_drive() if plan_file is None else drive.read_drive_plan(plan_file)
     note_plan_too_far(plan)
-    with output_folder(out, "drive", OUTPUTS, force, plan):
+    with output_folder(out, "drive", drive.OUTPUTS, force, plan):
         with LongWork("driving, cm") as progress:
-            drive = run_drive(plan, seed=seed, workers=workers, progress=progress)
+            found = drive.run_drive(plan, seed=seed, workers=workers, progress=progress)
         with LongWork("drawing"):
-            files = write_drive(drive, out, force=force)
-    facts = drive.as_dict()
+            files = drive.write_drive(found, out, force=force)
+    facts = found.as_dict()
     if as_json:
         return echo_json({"files": [str(path) for path in files], **facts})
     _echo_drive(facts)
@@ -141,32 +139,21 @@ def landmark_design(
     example
         Print the default plan, and do nothing else.
     """
-    from phasemark.matcher.design import (
-        confirm_design,
-        default_design,
-        example_design,
-        output_names,
-        read_design_plan,
-        run_design,
-        summary,
-        write_design,
-    )
-
     if example:
-        return echo(example_design().removesuffix("\n"))
-    plan = default_design() if plan_file is None else read_design_plan(plan_file)
+        return echo(design.example_design().removesuffix("\n"))
+    plan = design.default_design() if plan_file is None else design.read_design_plan(plan_file)
     if seed is not None:
         plan = plan.model_copy(update={"seed": seed})
-    with output_folder(out, "landmark design", output_names(plan), force, plan):
+    with output_folder(out, "landmark design", design.output_names(plan), force, plan):
         with LongWork("searching") as progress:
-            design = run_design(plan, workers=workers, progress=progress)
+            found = design.run_design(plan, workers=workers, progress=progress)
         confirmed = None
         if confirm:
             with LongWork("matching simulated frames") as progress:
-                confirmed = confirm_design(design, confirm, workers=workers, progress=progress)
+                confirmed = design.confirm_design(found, confirm, workers=workers, progress=progress)
         with LongWork("writing the design"):
-            files = write_design(design, confirmed, out, force=force)
-    facts = summary(design, confirmed)
+            files = design.write_design(found, confirmed, out, force=force)
+    facts = design.summary(found, confirmed)
     if as_json:
         return echo_json({"files": [str(path) for path in files], **facts})
     _echo_design(facts)

@@ -13,6 +13,7 @@ from phasemark.data.commands.console import LongWork, echo, echo_json, echo_tabl
 from phasemark.data.commands.inputs import note_plan_too_far
 from phasemark.data.commands.options import Force, Index, Json, Out, Seed, Workers, one_of
 from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
+from phasemark.matcher import sweep  # it imports what is used
 
 Folder = Annotated[Path, Shown(metavar="DIR", help="A sweep's folder.")]
 
@@ -53,23 +54,25 @@ def sweep_run(
     force
         Start over where the folder holds a sweep.
     """
-    from phasemark.matcher.sweep.plan import Method, SweepPlan, read_sweep_plan, refuse_programs
+    from phasemark.matcher.sweep.plan import refuse_programs
     from phasemark.matcher.sweep.report import write_report
-    from phasemark.matcher.sweep.run import run_sweep, sweep_outputs
+    from phasemark.matcher.sweep.run import sweep_outputs
 
-    loaded = read_sweep_plan(plan_or_name)
+    loaded = sweep.read_sweep_plan(plan_or_name)
     changes: dict[str, Any] = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     if not trust_plan:
         refuse_programs(loaded, () if matcher is None else (matcher,), plan_or_name)
     if matcher is not None and matcher not in [method.method for method in loaded.methods]:
-        changes["methods"] = (*loaded.methods, Method(name=matcher, method=matcher))
-    changed = SweepPlan(**{**loaded.model_dump(), **changes})
+        changes["methods"] = (*loaded.methods, sweep.Method(name=matcher, method=matcher))
+    changed = sweep.SweepPlan(**{**loaded.model_dump(), **changes})
     if any(method.is_program for method in changed.methods):
         sys.path.append(str(Path.cwd()))  # where one's own matcher lies; an installed program does not look here itself
     note_plan_too_far(changed)
     refuse_input_files(sweep_outputs(out), changed)
     with LongWork("trials") as progress:
-        run_sweep(changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress)
+        sweep.run_sweep(
+            changed, out, workers=workers, scheduler=scheduler, resume=resume, force=force, progress=progress
+        )
     with LongWork("writing the report"):
         report = write_report(out)
     echo(report)
@@ -78,11 +81,10 @@ def sweep_run(
 def sweep_report(folder: Folder, *, as_json: Json = False) -> None:
     """Write a sweep's tables, figures and report again."""
     from phasemark.matcher.sweep.report import summary, write_report
-    from phasemark.matcher.sweep.run import read_sweep
 
     with LongWork("writing the report"):
         report = write_report(folder)
-    trials = read_sweep(folder)[1]
+    trials = sweep.read_sweep(folder)[1]
     cells = trials.cells()
     if as_json:
         return echo_json({"report": str(report), "cells": [cell.as_dict() for cell in cells]})
@@ -104,11 +106,10 @@ def sweep_frames(folder: Folder, condition: Index, trial: Index, *, out: Out, fo
     from phasemark.data.files.folder_marker import read_marker
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.data.measured.reading import write_measured
-    from phasemark.matcher.sweep import run
 
     refuse_inputs([out], map(folder.joinpath, read_marker(folder)[1] or ()))
     refuse_existing([out], force)
-    echo(write_measured(run.sweep_frames(folder, condition, trial), out, force=force))
+    echo(write_measured(sweep.sweep_frames(folder, condition, trial), out, force=force))
 
 
 def sweep_compare(
@@ -129,10 +130,7 @@ def sweep_compare(
     all_
         Show differences that may be chance, too.
     """
-    from phasemark.matcher.sweep.compare import compare_cells
-    from phasemark.matcher.sweep.run import read_sweep
-
-    found = compare_cells(*(read_sweep(folder)[1].cells() for folder in (first, second)))
+    found = sweep.compare_cells(*(sweep.read_sweep(folder)[1].cells() for folder in (first, second)))
     if as_json:
         return echo_json([one.as_dict() for one in found])
     shown = [one for one in found if one.significant or all_]
@@ -166,14 +164,12 @@ def demo_report(
         Folder for trials, tables and the report.
     """
     from phasemark.matcher.sweep.answer import answer
-    from phasemark.matcher.sweep.plan import read_sweep_plan
     from phasemark.matcher.sweep.report import VIEW_HEADER, view_rows, write_report
-    from phasemark.matcher.sweep.run import run_sweep
 
     refuse_existing([out / "plan.json"], force)
-    plan = read_sweep_plan("demo").model_copy(update={"seed": seed})
+    plan = sweep.read_sweep_plan("demo").model_copy(update={"seed": seed})
     with LongWork("matching") as progress:
-        trials = run_sweep(plan, out, workers=workers, force=force, progress=progress)
+        trials = sweep.run_sweep(plan, out, workers=workers, force=force, progress=progress)
     with LongWork("writing the report"):
         report = write_report(out)
     cells = trials.cells()
