@@ -7,6 +7,7 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
+from operator import methodcaller
 
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.sources import Arrival, Source, SourceFault
@@ -85,7 +86,7 @@ class Live:
             while not self._stop.is_set():
                 try:
                     update = self._located(self._newest.get(timeout=0.05))
-                    self._publish(update)
+                    self._for_sinks(methodcaller("update", update))
                     if on_update is not None:
                         on_update(update)
                 except queue.Empty:
@@ -169,24 +170,19 @@ class Live:
         self._offset_s = min(self._offset_s + _DRIFT / 15, apart)
         return self._offset_s
 
-    def _publish(self, update: Update) -> None:
-        for sink in self.sinks:
-            self._guarded(sink, lambda own: own.update(update))
-
     def _report(self) -> None:
-        for sink in self.sinks:
-            self._guarded(sink, lambda own: own.status(self.status))
+        self._for_sinks(lambda sink: sink.status(self.status))
 
-    def _guarded(self, sink: Sink, act: Callable[[Sink], None]) -> None:
-        """Let a sink act; one that fails is said in a line, and used again with the next frame."""
-        try:
-            act(sink)
-        except OSError as error:
-            if isinstance(error, BrokenPipeError) and sink.name == "-":  # nobody reads standard output any more
-                self._error.append(error)
-                self._stop.set()
-                return
-            line = f"{sink.name}: {error.strerror or error}"
-            if line != self._said:
-                self._said = line
-                self._say(line)
+    def _for_sinks(self, act: Callable[[Sink], None]) -> None:
+        """Let each sink act; one that fails is said in a line, and used again with the next frame."""
+        for sink in self.sinks:
+            try:
+                act(sink)
+            except OSError as error:
+                line = f"{sink.name}: {error.strerror or error}"
+                if isinstance(error, BrokenPipeError) and sink.name == "-":  # nobody reads standard output any more
+                    self._error.append(error)
+                    self._stop.set()
+                elif line != self._said:
+                    self._said = line
+                    self._say(line)

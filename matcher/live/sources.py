@@ -76,7 +76,7 @@ class Source(ABC):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.n_damaged, self.damage = 0, ""
+        self.n_damaged, self.damage, self._stopped = 0, "", False
 
     @abstractmethod
     def frames(self) -> Iterator[Arrival]:
@@ -88,8 +88,9 @@ class Source(ABC):
             It has to be opened again.
         """
 
-    def stop(self) -> None:  # noqa: B027  a source may end by itself
+    def stop(self) -> None:
         """Let :meth:`frames` end soon; called from another thread."""
+        self._stopped = True
 
     def spoilt(self, damage: str, n: int = 1) -> None:
         """Count frames that are left out."""
@@ -253,7 +254,7 @@ class Tmf8829Source(Source):
         self._zmq = needed("zmq", "ZeroMQ", "live")
         host, port = address_of(name)
         self._address = f"tcp://{host or '127.0.0.1'}:{port}"
-        self._sensor, self._stopped = sensor, False
+        self._sensor = sensor
         self._how = {key: value for key, value in how.items() if key != "board"}
         self._shape = shape_before(sensor, int(how.get("rotate", 0)))
 
@@ -279,10 +280,6 @@ class Tmf8829Source(Source):
                     self.spoilt(str(error))
         finally:
             socket.close()
-
-    def stop(self) -> None:
-        """Let the wait for the next message end."""
-        self._stopped = True
 
     def _row(self, message: bytes) -> Recording:
         """Return the ranges of a message."""
@@ -321,7 +318,7 @@ class Replay(Source):
 
     def __init__(self, name: str, in_time: bool) -> None:
         super().__init__(name)
-        self._in_time, self._stopped = in_time, False
+        self._in_time = in_time
 
     @abstractmethod
     def recorded(self) -> Iterator[tuple[Any, float | None]]:
@@ -338,10 +335,6 @@ class Replay(Source):
             if self._stopped:
                 return
             yield Arrival(frames, time.monotonic())
-
-    def stop(self) -> None:
-        """Let the frames end."""
-        self._stopped = True
 
 
 class RecordedSource(Replay):

@@ -54,11 +54,7 @@ class Status:
         latency = 1e3 * np.array([own[2] for own in recent])
         reasons = Counter(own[1] for own in recent if own[1])
         return {
-            "source": self.source,
-            "frames": self.frames,
-            "accepted": self.accepted,
-            "dropped": self.dropped,
-            "damaged": self.damaged,
+            **{name: getattr(self, name) for name in ("source", "frames", "accepted", "dropped", "damaged")},
             "rate_hz": round(len(recent) / _WINDOW_S, 1),
             "accepted_share": round(sum(not own[1] for own in recent) / max(len(recent), 1), 3),
             "tracked_share": round(sum(own[3] for own in recent) / max(len(recent), 1), 3),

@@ -58,9 +58,7 @@ class Update:
         found = self.located.estimate
         row: dict[str, Any] = {
             "index": self.number,
-            "stamp_s": self.stamp_s,
-            "pose_stamp_s": self.pose_stamp_s,
-            "time_s": self.time_s,
+            **{name: getattr(self, name) for name in ("stamp_s", "pose_stamp_s", "time_s")},
             "accepted": not self.reason,
             "reason": self.reason,
             "latency_ms": 1e3 * self.latency_s,
