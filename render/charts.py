@@ -15,14 +15,18 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patches import Ellipse
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 STYLES = (
     ("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"), ("#CC79A7", "D", "-."),
     ("#56B4E9", "v", "-"), ("#E69F00", "P", "--"),
 )  # fmt: skip
 """Colour, mark and stroke of what a figure compares."""
+ENLARGED = 10.0
+"""Ellipses of centimetres would be lost in a room of metres."""
 
 
 def style(k: int) -> tuple[str, str, str]:
@@ -74,6 +78,15 @@ def explain(
 def legend_above(figure: Figure, panel: Axes) -> None:
     """Put the legend of a panel above all: with many entries it would cover what it explains."""
     figure.legend(*panel.get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize=7)
+
+
+def enlarged_ellipse(pose: ArrayLike, covariance: NDArray[np.float64], **look: Any) -> Ellipse:
+    """Return the 95 % ellipse of the position of a pose (x, y, …), `ENLARGED` times."""
+    x, y = np.asarray(pose, np.float64)[:2].tolist()
+    values, vectors = np.linalg.eigh(covariance[:2, :2])
+    axes = 2 * ENLARGED * np.sqrt(np.maximum(values, 0) * special.chdtri(2, 0.05))
+    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
+    return Ellipse((x, y), float(axes[1]), float(axes[0]), angle=angle, fc="none", **look)
 
 
 def with_intervals(panel: Axes, x: ArrayLike, estimates: Sequence[Any], **look: Any) -> None:

@@ -8,19 +8,14 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Ellipse, Polygon
-from numpy.typing import NDArray
-from scipy import stats
+from matplotlib.patches import Circle, Polygon
 
 from phasemark.landmarks import catalog
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
 from phasemark.matcher.sequence.planar import rotation
-from phasemark.render.charts import explain
+from phasemark.render.charts import ENLARGED, enlarged_ellipse, explain
 
 _TRUE, _DEAD, _CORRECTED, _MARK = "#1a1a1a", "#c8553d", "#2a6fbb", "#5b8c5a"
-_ENLARGED = 10.0
-"""Ellipses of centimetres would be lost in a room of metres."""
-_LEVEL = 0.95
 
 
 def drive_figure(drive: Drive) -> Figure:
@@ -51,7 +46,7 @@ def drive_figure(drive: Drive) -> Figure:
         fontsize=10,
     )
     # the legend stands below the room: no corner of it is sure to be empty
-    room.plot([], [], color=_CORRECTED, lw=0.8, label=f"95 % ellipses before and after a correction, × {_ENLARGED:g}")
+    room.plot([], [], color=_CORRECTED, lw=0.8, label=f"95 % ellipses before and after a correction, × {ENLARGED:g}")
     room.legend(loc="upper center", bbox_to_anchor=(0.5, -0.08), ncols=4, fontsize=8, frameon=False)
     _draw_errors(figure.add_subplot(grid[0, 1]), drive, position=True)
     _draw_errors(figure.add_subplot(grid[1, 1]), drive, position=False)
@@ -86,17 +81,9 @@ def _draw_stop(axes: Axes, stop: Stop) -> None:
     if not stop.used:
         axes.plot(*stop.true[:2], "x", color=_DEAD, ms=7, zorder=5)
         return
-    axes.add_patch(_ellipse(stop.before, stop.covariance_before, 0.8))
-    axes.add_patch(_ellipse(stop.after, stop.covariance_after, 1.4))
+    axes.add_patch(enlarged_ellipse(stop.before, stop.covariance_before, ec=_CORRECTED, lw=0.8, zorder=3))
+    axes.add_patch(enlarged_ellipse(stop.after, stop.covariance_after, ec=_CORRECTED, lw=1.4, zorder=3))
     axes.add_patch(Circle((float(stop.true[0]), float(stop.true[1])), 0.035, fc=_TRUE, ec="none", zorder=4))
-
-
-def _ellipse(pose: NDArray[np.float64], covariance: NDArray[np.float64], width: float) -> Ellipse:
-    values, vectors = np.linalg.eigh(covariance[:2, :2])
-    axes = 2 * _ENLARGED * np.sqrt(np.maximum(values, 0) * stats.chi2.ppf(_LEVEL, 2))
-    angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-    centre = (float(pose[0]), float(pose[1]))
-    return Ellipse(centre, float(axes[1]), float(axes[0]), angle=angle, fc="none", ec=_CORRECTED, lw=width, zorder=3)
 
 
 def _draw_errors(axes: Axes, drive: Drive, *, position: bool) -> None:

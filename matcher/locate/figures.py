@@ -9,16 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from phasemark.matcher.locate.kernel_arguments import Outline
 from phasemark.matcher.locate.locator import LocatedPose
-from phasemark.render.charts import explain, legend_above, panels_of, style
+from phasemark.render.charts import ENLARGED, enlarged_ellipse, explain, legend_above, panels_of, style
 
-_ENLARGED = 10.0
-"""Ellipses of centimetres would be lost in a room of metres."""
 _ARROW_M = 0.15
 
 
@@ -41,7 +37,7 @@ def locate_figure(
         panel.add_collection(LineCollection(list(outline.pieces.reshape(-1, 2, 2)), colors="#777777", linewidths=1.5))
         if truth is not None:
             panel.plot(*truth[:, :2].T, "x", color="#1a1a1a", ms=5, label="truth")
-        _draw(panel, [one for one in answers if one.accepted], 0, f"accepted, 95 % ellipses × {_ENLARGED:g}")
+        _draw(panel, [one for one in answers if one.accepted], 0, f"accepted, 95 % ellipses × {ENLARGED:g}")
         _draw(panel, [one for one in answers if not one.accepted and math.isfinite(one.x_m)], 1, "refused")
         panel.set_aspect("equal")
         explain(panel, "x (m)", "y (m)", name)
@@ -59,7 +55,4 @@ def _draw(panel: Axes, answers: Sequence[LocatedPose], k: int, label: str) -> No
     ends = np.column_stack([x, y, x + _ARROW_M * np.cos(yaw), y + _ARROW_M * np.sin(yaw)])
     panel.add_collection(LineCollection(list(ends.reshape(-1, 2, 2)), colors=colour, linewidths=1))
     for one in answers if k == 0 else ():
-        values, vectors = np.linalg.eigh(one.covariance[:2, :2])
-        along = 2 * _ENLARGED * np.sqrt(np.maximum(values, 0) * chi2.isf(0.05, 2))
-        angle = math.degrees(math.atan2(vectors[1, 1], vectors[0, 1]))
-        panel.add_patch(Ellipse((one.x_m, one.y_m), along[1], along[0], angle=angle, fc="none", ec=colour, lw=0.8))
+        panel.add_patch(enlarged_ellipse(one.pose, one.covariance, ec=colour, lw=0.8))
