@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -52,6 +52,11 @@ def write_atomically(
         for piece in pieces:
             file.write(piece)
     return Path(path)
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes], *, force: bool) -> list[Path]:
+    """Write several files of a folder, by their names, each as :func:`write_atomically` does."""
+    return [write_atomically(folder / name, content, force=force) for name, content in contents.items()]
 
 
 @contextmanager

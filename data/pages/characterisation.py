@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.atomic_write import write_files
 from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.provenance import versions
@@ -86,7 +86,7 @@ def write_characterisation(
         "points.csv": _points_csv(found).encode(),
         **{f"{title}.png": png for title, png in pictures.items()},
     }
-    return [write_atomically(folder / file, content, force=force) for file, content in files.items()]
+    return write_files(folder, files, force=force)
 
 
 def summary_sentences(found: Characterisation, name: str) -> list[str]:

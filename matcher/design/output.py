@@ -11,7 +11,7 @@ from typing import Any
 
 import trimesh
 
-from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.atomic_write import write_files
 from phasemark.data.files.csv_cell import csv_text, nine_digits
 from phasemark.data.files.json_text import finite_or_none, json_text
 from phasemark.data.pages.page import figure_png
@@ -236,7 +236,4 @@ def write_design(design: Design, confirmed: Confirmed | None, folder: Path, *, f
         figure_png(bound_figure(design, confirmed)),
         *map(mesh_stl, design.result.specs),
     ]
-    names = output_names(design.plan)
-    return [
-        write_atomically(folder / name, content, force=force) for name, content in zip(names, contents, strict=True)
-    ]
+    return write_files(folder, dict(zip(output_names(design.plan), contents, strict=True)), force=force)

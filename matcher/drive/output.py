@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.data.files.atomic_write import write_atomically
+from phasemark.data.files.atomic_write import write_files
 from phasemark.data.files.csv_cell import csv_text, nine_digits
 from phasemark.data.files.json_text import json_text
 from phasemark.matcher.drive.simulate import Drive, Stop, pose_error
+from phasemark.render.png import figure_png
 
 OUTPUTS = ("path.csv", "stops.csv", "summary.json", "drive.png")
 """Files that :func:`write_drive` writes."""
@@ -86,13 +86,10 @@ def write_drive(drive: Drive, folder: Path, *, force: bool = False) -> list[Path
     """
     from phasemark.matcher.drive.figures import drive_figure  # matplotlib is slow to import
 
-    figure = io.BytesIO()
-    drive_figure(drive).savefig(figure, format="png", dpi=130)
+    figure = figure_png(drive_figure(drive), dpi=130)
     text = json_text(drive.as_dict(), indent=2, allow_nan=False) + "\n"
-    contents = (path_csv(drive).encode(), stops_csv(drive).encode(), text.encode(), figure.getvalue())
-    return [
-        write_atomically(folder / name, content, force=force) for name, content in zip(OUTPUTS, contents, strict=True)
-    ]
+    contents = (path_csv(drive).encode(), stops_csv(drive).encode(), text.encode(), figure)
+    return write_files(folder, dict(zip(OUTPUTS, contents, strict=True)), force=force)
 
 
 def _flat(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
