@@ -21,8 +21,12 @@ from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad
 
 
-def model_range_m(bank: Bank, match: Match, background: Background | None) -> NDArray[np.float64]:
-    """Return the ranges of the model image a match names, (rows, cols); NaN where it returns too little to measure.
+def model_image(
+    bank: Bank, match: Match, background: Background | None, *, reported: bool = False
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ranges of the model image a match names, and the share of each pixel on the landmark; (rows, cols) each.
+
+    A range is NaN where it returns too little to measure.
 
     Parameters
     ----------
@@ -31,14 +35,9 @@ def model_range_m(bank: Bank, match: Match, background: Background | None) -> ND
         Where it has no covariance, its view is one of the bank's grid.
     background : Background, optional
         What the model is composed with, as in the matcher.
+    reported : bool
+        Whether the ranges are those the chip reports.
     """
-    return model_image(bank, match, background)[0]
-
-
-def model_image(
-    bank: Bank, match: Match, background: Background | None, *, reported: bool = False
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the result of :func:`model_range_m` and the share of each pixel on the landmark; (rows, cols) each."""
     name = match.class_name or match.alternatives[0].class_name
     if match.covariance is not None:
         mesh = bank.mesh(name)

@@ -10,7 +10,7 @@ from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Match, Matcher, Matches, kalman_filter
-from phasemark.matcher.figures import match_figure, model_range_m
+from phasemark.matcher.figures import match_figure, model_image
 from phasemark.matcher.filters import PixelState, noise_free
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.nearest.templates import Observation, Templates
@@ -233,7 +233,7 @@ def test_the_model_beside_a_match_is_the_bank_image_composed_with_the_background
     keys, images = bank_images(bank, WALL)
     k = keys.index(("cone", 5, 4))
     (match,) = Matcher(bank, background=WALL).match(noise_free(images, 50)[k])
-    model = model_range_m(bank, match, WALL)
+    model = model_image(bank, match, WALL)[0]
     np.testing.assert_allclose(model, images.range_m[k], atol=1e-6)  # float32 phasors
     assert len(match_figure(noise_free(images, 50), match, bank, WALL, k).axes) == 6  # three panels, three colour bars
 
@@ -245,7 +245,7 @@ def test_the_model_beside_a_match_of_a_tilted_camera_is_tilted(bank):
     )
     frames = noise_free(image, 50)
     (match,) = Matcher(bank, "refine", free=free).match(frames)
-    residual = (frames.range_m[0] - model_range_m(bank, match, None)) / frames.std_m[0]
+    residual = (frames.range_m[0] - model_image(bank, match, None)[0]) / frames.std_m[0]
     assert np.nanmax(np.abs(residual)) < 1  # 5 and more without pitch and roll
     assert np.isfinite(residual).sum() > 60
 
@@ -254,7 +254,7 @@ def test_the_model_beside_a_match_is_found_in_a_bank_of_more_than_one_period(tmp
     plan = BankPlan(classes=("cone",), distance_m="0.9:1.1:0.1", delta_deg="0:360:30")  # repeats after 180°
     with build_bank(plan, tmp_path / "bank.h5") as opened:
         match = Match("cone", True, distance_m=1.0, delta_rad=math.radians(30), symmetry=2)
-        model, image = model_range_m(opened, match, None), opened.image("cone", 1, 1)
+        model, image = model_image(opened, match, None)[0], opened.image("cone", 1, 1)
         shown = np.isfinite(model)
         assert shown.sum() > 20
         np.testing.assert_allclose(model[shown], image.range_m[0][shown], atol=1e-6)

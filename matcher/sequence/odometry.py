@@ -14,9 +14,6 @@ from phasemark.matcher.sequence.planar import rotation
 
 _Floats = NDArray[np.float64]
 
-STATE = ("x_m", "y_m", "heading_rad", "slip", "gyro_bias_rad_s")
-"""What the filter estimates: the pose, and the two errors that last."""
-
 
 @dataclass(frozen=True)
 class Reading:
@@ -66,7 +63,10 @@ class OdometryPlan(PlanModel):
     gyro_noise_deg_per_sqrt_s: Std = 0.1
 
     def start(self, pose_covariance: _Floats) -> _Floats:
-        """Return the covariance of the whole state at the start, (5, 5)."""
+        """Return the covariance of the whole state at the start, (5, 5).
+
+        The state is the pose (x_m, y_m, heading_rad), and the two errors that last: slip, gyro_bias_rad_s.
+        """
         covariance = np.zeros((5, 5))
         covariance[:3, :3] = pose_covariance
         covariance[3, 3], covariance[4, 4] = self.slip_std**2, math.radians(self.gyro_bias_std_deg_s) ** 2
@@ -87,7 +87,7 @@ def moved(state: _Floats, reading: Reading) -> _Floats:
     Parameters
     ----------
     state : (5,) float64
-        In the order of :data:`STATE`.
+        In the order of :meth:`OdometryPlan.start`.
     reading : Reading
     """
     turn = reading.turn_rad - state[4] * reading.time_s
