@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.command import Shown
@@ -247,10 +247,12 @@ def _start(
     albedo = float(mesh.metadata.get("albedo", 0.8)) if stated is None else stated
     if not 0 < albedo <= 1:
         raise UsageError(f"--albedo must be in (0, 1], got {albedo:g}")
-    bearing_rad, delay_s = bearing_deg and math.radians(bearing_deg), delay_ms and delay_ms / 1e3
-    others = {"height_m": height, "bearing_rad": bearing_rad, "delay_s": delay_s}
-    known: dict[str, Any] = {name: value for name, value in others.items() if value is not None}
-    return replace(Mounting.of_sensor(base, albedo), **known)
+    start = Mounting.of_sensor(base, albedo)
+    if height is not None:
+        start = replace(start, height_m=height)
+    if bearing_deg is not None:
+        start = replace(start, bearing_rad=math.radians(bearing_deg))
+    return start if delay_ms is None else replace(start, delay_s=delay_ms / 1e3)
 
 
 def _write_calibration(
