@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 from PIL.PngImagePlugin import PngImageFile
 
-from phasemark import OutputExistsError, UsageError
+from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import FramePlan, build_frames, read_frames
 from phasemark.data.export import export_frames
 from phasemark.render import Views, preset
@@ -233,6 +233,27 @@ def test_bop_models_load_as_the_toolkit_loads_them(bop):
             np.testing.assert_allclose(np.ptp(points[:, k]), info[f"size_{axis}"], atol=1e-3)
         for turn in info.get("symmetries_discrete", []):
             np.testing.assert_allclose(np.reshape(turn, (4, 4))[3], [0, 0, 0, 1])
+
+
+def test_a_bag_whose_images_are_millimetres_and_metres_is_refused(tmp_path):
+    rosbags = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    image, header, stamp = (
+        store.types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
+    )
+    with rosbags.Writer(tmp_path / "both", version=9) as writer:
+        link = writer.add_connection("/tof/depth", "sensor_msgs/msg/Image", typestore=store)
+        for k, (encoding, kind, value) in enumerate((("16UC1", "<u2", 700), ("32FC1", "<f4", 0.7))):
+            data = np.full((8, 8), value, kind)
+            message = image(
+                header=header(stamp=stamp(sec=k, nanosec=0), frame_id="camera"), height=8, width=8, encoding=encoding,
+                is_bigendian=0, step=data.strides[0], data=data.view(np.uint8).ravel(),
+            )  # fmt: skip
+            writer.write(link, k * 10**9, store.serialize_cdr(message, "sensor_msgs/msg/Image"))
+    with pytest.raises(InputFileError, match="'/tof/depth' must hold images of one encoding, 16UC1"):
+        read_frames(tmp_path / "both", sensor=preset("vl53l5cx-8x8"), quantity="z")
 
 
 def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):

@@ -526,6 +526,8 @@ def test_the_command_replays_a_recording(bank, printed, tmp_path, capsys):
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert len(rows) == 10
     assert rows[-1]["accepted"]
+    assert main([*words, "--delay-ms", "nan"]) == 2
+    assert "--delay-ms must be from -10000 to 10000, got nan" in capsys.readouterr().err
     assert main(["live", str(path), "--landmark", "cone"]) == 2
     assert "--landmark cone needs --sensor NAME" in capsys.readouterr().err
 

@@ -285,6 +285,29 @@ def test_a_drive_is_followed_from_its_odometry_and_smoothing_makes_it_no_worse()
     assert np.hypot(*(again[5].pose - path[5])[:2]) < 0.2
 
 
+def test_a_robot_that_is_not_where_it_is_expected_is_believed_at_the_second_stop():
+    one, rig, path, recording = drive(np.random.default_rng(9), stops=8)
+    carried = recording.odometry + np.where(np.arange(8)[:, None] < 4, 0.0, [1.0, 0.5, 0.0])  # between two stops
+    answers = Locator(one, rig).follow(replace(recording, odometry=carried))
+    assert [answer.reason for answer in answers] == ["", "", "", "", "unexpected", "", "", ""]
+    assert np.abs(answers[4].pose - path[4])[:2].max() < 0.1  # what it would be
+
+
+def test_starts_of_other_stops_lead_to_no_pose_far_from_them():
+    accepted = {"right": 0, "of another stop": 0}
+    for seed in range(6):
+        rng = np.random.default_rng([23, seed])
+        one, rig, std = random_room(rng), ring_rig(4), np.array([0.2, 0.2, 0.09])
+        poses = free_poses(one, 6, rng)
+        recording = simulated_recording(one, rig, poses, rng)
+        right = poses + std * rng.normal(size=poses.shape)
+        for name, starts in (("right", right), ("of another stop", np.roll(poses, 1, axis=0))):
+            answers = Locator(one, rig).locate(recording, starts, std)
+            accepted[name] += sum(answer.accepted for answer in answers)
+    assert accepted["right"] >= 30
+    assert accepted["of another stop"] <= 1  # 4 where a pose may be anywhere
+
+
 def test_a_recording_is_read_as_it_was_written_and_its_faults_are_named(tmp_path):
     _, rig, _, recording = drive(np.random.default_rng(8), stops=3)
     file = tmp_path / "drive.npz"
@@ -309,6 +332,11 @@ def test_a_recording_is_read_as_it_was_written_and_its_faults_are_named(tmp_path
     file.write_bytes(b"PK\x03\x04 and no more")
     with pytest.raises(InputFileError, match="not an NPZ file"):
         read_rig_recording(file, rig)
+
+
+def test_a_map_that_is_ten_thousand_kilometres_long_takes_no_memory():
+    grid = Locator(WallMap(walls_m=[[0, 0, 1e7, 0]]), ring_rig(2))._grid
+    assert grid.range_m.nbytes < 1e9
 
 
 def test_a_sensor_that_is_stuck_is_left_out_and_odometry_that_jumps_refuses_the_stop(tmp_path):

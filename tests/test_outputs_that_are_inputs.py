@@ -35,6 +35,7 @@ def given(tmp_path, monkeypatch):
 
 
 CASES = {
+    "sensor show": ("cam.toml", "out.png", "cam.toml --picture out.png"),
     "sensor characterise": ("cam.toml", "dir/points.csv", "cam.toml --out dir"),
     "sensor fit": ("frames.csv", "out.toml", "frames.csv --distance 1 --out out.toml"),
     "sensor fit-direct": ("frames.csv", "out.toml", "ladder.npz --object frames.csv,part.stl --out out.toml"),

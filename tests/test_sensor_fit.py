@@ -220,6 +220,17 @@ def test_a_direct_sensor_has_an_offset_and_one_figure_of_noise():
     assert fit.sensor.kind == "direct"
 
 
+@pytest.mark.parametrize(
+    ("name", "stated", "board"),
+    [("vl53l5cx-8x8", (0.5, 1.3, 1.5), "1.3 m"), ("pmd-16x16", (1.0, 1.5, 0.5), "0.5 m")],
+)
+def test_a_board_whose_distance_is_wrong_or_in_another_order_is_named(name, stated, board):
+    camera = preset(name)
+    boards = [take(camera, distance, amplitude=False, intensity=False) for distance in (0.5, 1.0, 1.5)]
+    with pytest.raises(UsageError, match=rf"the board at {board} measures .* off what the others do: is its distance"):
+        fit_sensor(boards, stated, base=camera, albedo=[0.8])
+
+
 # What one distance tells, and what is odd
 
 

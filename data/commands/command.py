@@ -30,7 +30,7 @@ _SUFFIX = re.compile(r"(?<!_or)_(?:file|name)$|_$")
 """End of a parameter's name that its flag or metavar does not have."""
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
-OUTPUTS = ("out", "plot", "estimates", "to")
+OUTPUTS = ("out", "plot", "picture", "estimates", "to")
 """Parameters of commands that name what is written; all other files that a command is given are read."""
 
 inputs_given: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())

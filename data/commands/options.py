@@ -171,7 +171,7 @@ class Building:
     dry_run
         Print how large the file would be and how long it would take, and build nothing.
     max_size
-        Refuse to write a larger file, e.g. 500MB or 20GB.
+        Refuse to write larger images or frames, e.g. 500MB or 20GB; meshes and header are not counted.
     shard
         Build only part I of N, to be merged.
     shard_size

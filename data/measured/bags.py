@@ -80,6 +80,8 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
     images, amplitudes = found.get(chosen, []), found.get(AMPLITUDE_TOPIC, [])
     if not images or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: '{chosen}' must hold images of one size")
+    if len(units) > 1:
+        raise InputFileError(f"{path}: '{chosen}' must hold images of one encoding, 16UC1 (mm) or 32FC1 (m), not both")
     values = np.stack(images)
     arrays = {"range": np.where(values == 0, np.nan, values)}
     if len(amplitudes) == len(images):

@@ -19,7 +19,7 @@ from phasemark.data.commands.console import LongWork, echo_json, tell
 from phasemark.data.commands.inputs import open_any_bank, read_landmark, read_sensor
 from phasemark.data.commands.options import Force, FrameReading, Json, MeshReading, SensorName
 from phasemark.data.commands.outputs import refuse_input_files
-from phasemark.matcher.commands.match_options import Landmark, Search
+from phasemark.matcher.commands.match_options import Landmark, Search, check_delay
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,7 +51,9 @@ class Motion:
     flat: bool = False
 
     def check(self) -> None:
-        """Refuse speeds that are none."""
+        """Refuse speeds that are none, and delays that are no times."""
+        if self.delay_ms is not None:
+            check_delay(self.delay_ms)
         for flag, value in (("--speed", self.speed), ("--turn-rate", self.turn_rate)):
             if not 0 < value < math.inf:
                 raise UsageError(f"{flag} must be positive, got {value:g}")

@@ -20,7 +20,7 @@ from phasemark.data.commands.inputs import note_too_far, open_any_bank
 from phasemark.data.commands.options import FrameReading
 from phasemark.data.commands.outputs import refuse_unwritable_files, write_figure, write_file
 from phasemark.matcher.commands.diagnosis_flags import diagnosis_text
-from phasemark.matcher.commands.match_options import Landmark, Place, Results, Search
+from phasemark.matcher.commands.match_options import Landmark, Place, Results, Search, check_delay
 from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
 
 if TYPE_CHECKING:
@@ -76,9 +76,8 @@ def match_frames(
     landmarks = place.landmarks()
     results.check()
     search.check()
-    most_ms = 10_000
-    if delay_ms is not None and not abs(delay_ms) <= most_ms:
-        raise UsageError(f"--delay-ms must be from -{most_ms} to {most_ms}, got {delay_ms:g}")
+    if delay_ms is not None:
+        check_delay(delay_ms)
     if learn_orientation:
         _refuse_to_learn(reading, search)
     if search.is_direct:

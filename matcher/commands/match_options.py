@@ -434,3 +434,10 @@ class Results:
     def files(self, plots: dict[int, Path]) -> list[Path]:
         """Return all files that are written."""
         return [*([] if self.estimates is None else [self.estimates]), *plots.values()]
+
+
+def check_delay(delay_ms: float) -> None:
+    """Refuse a delay that no stamp of a frame has."""
+    most_ms = 10_000
+    if not abs(delay_ms) <= most_ms:
+        raise UsageError(f"--delay-ms must be from -{most_ms} to {most_ms}, got {delay_ms:g}")

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import special
 
 from phasemark import UsageError
 from phasemark.matcher.locate.kernel_arguments import Scan
@@ -24,7 +25,7 @@ from phasemark.matcher.pixel_agreement import DISAGREEMENT
 
 _Float = NDArray[np.float64]
 
-LocateReason = Literal["", "no zones", "odometry jumps", "poor fit", "undetermined", "ambiguous"]
+LocateReason = Literal["", "no zones", "odometry jumps", "poor fit", "undetermined", "ambiguous", "unexpected"]
 _SAME_FRAMES = 3
 """Frames of a stop that count as one opinion: what the map has wrong is wrong in all of them, and in all rows."""
 _MOST_STARTS, _MOST_REFINED = 32, 12
@@ -33,10 +34,13 @@ _NARROW = 2.0, 1.0
 _HOPELESS = 4 * DISAGREEMENT
 """Cost by which a start may exceed the best one after a descent on three frames."""
 _MOST_OUTLIERS = 2.0
-"""Outliers of a pose that no start speaks for, in those of the rig's noise: another room explains four columns of five.
+"""Outliers of a pose that no prior speaks for, in those of the rig's noise: another room explains four columns of five.
 """
 _LEAST_STD = 1e-6
 """Smallest standard deviation of a start, m and rad."""
+_SPEAKS_FOR, _CONTRADICTS = special.chdtri(3, [1e-2, 1e-4]).tolist()
+"""Squared distances of a pose from its prior, in standard deviations: up to which a prior speaks for the pose, and
+above which one of them is wrong."""
 _REACH_SIGMA = 3.5
 """Half the width of the region that is searched around a prior, in its standard deviations."""
 
@@ -69,7 +73,7 @@ class LocatedPose:
         Columns that were observed.
     accepted : bool
     reason : str
-        Why it is refused: no zones, odometry jumps, poor fit, undetermined, or ambiguous. Empty if it is accepted.
+        No zones, odometry jumps, poor fit, undetermined, ambiguous, unexpected: why it is refused. Empty if accepted.
     alternatives : tuple of PoseCandidate
         All poses that explain the stop nearly as well, best first, the answer itself among them.
     note : str
@@ -266,6 +270,9 @@ class Locator:
     ) -> tuple[LocatedPose, tuple[_Float, _Float] | None]:
         """Locate a stop from where the robot is expected, in the whole map where that fails, or without a prior.
 
+        A pose of the whole map that contradicts the prior is refused, but the next stop is expected from there: two
+        that agree with each other are believed.
+
         Returns
         -------
         LocatedPose
@@ -273,8 +280,10 @@ class Locator:
             What is known of the pose then.
         """
         answer = self._located(recording, k, prior)
-        if prior is not None and answer.reason in ("poor fit", "ambiguous"):
+        if prior is not None and answer.reason in ("poor fit", "ambiguous", "unexpected"):
             anywhere = self._located(recording, k, None)
+            if anywhere.accepted and self._squared_distance(anywhere.pose, prior) > _CONTRADICTS:
+                return replace(anywhere, accepted=False, reason="unexpected"), (anywhere.pose, anywhere.covariance)
             answer = anywhere if anywhere.accepted else answer
         return answer, (answer.pose, answer.covariance) if answer.accepted else prior
 
@@ -386,11 +395,14 @@ class Locator:
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
         least = self.least_explained
-        if prior is None:
+        off = math.inf if prior is None else self._squared_distance(best.pose, prior)
+        if off > _SPEAKS_FOR:
             least = max(least, 1 - _MOST_OUTLIERS * self.rig.noise.outliers)
         reason = self._reason(
             least, fits, near, np.sqrt(np.diag(self.wall_map.part) + std_without_one(model, scan, best) ** 2)
         )
+        if not reason and _CONTRADICTS < off < math.inf:
+            reason = "unexpected"
         return LocatedPose(
             ("", 0, 0),
             x,
@@ -405,6 +417,11 @@ class Locator:
             evidence=_without(best, prior),
             tilt=self._tilt(best),
         )
+
+    def _squared_distance(self, pose: _Float, prior: tuple[_Float, _Float]) -> float:
+        """Return the squared distance of a pose from its prior, in standard deviations."""
+        off = difference(pose, prior[0])
+        return float(off @ np.linalg.solve(prior[1] + self.wall_map.part, off))
 
     def _tilt(self, fit: StopFit) -> tuple[_Float, _Float] | None:
         """Return height, pitch and roll of a fit in space and their covariance, height above the map's zero."""

@@ -54,7 +54,8 @@ def pose_grid(outline: Outline, reach_m: float) -> PoseGrid:
 
 def _grid_over(outline: Outline, bounds_m: tuple[float, float, float, float]) -> PoseGrid:
     low_x, low_y, high_x, high_y = bounds_m
-    spacing = max(_SPACING_M, math.sqrt((high_x - low_x) * (high_y - low_y) / _MOST_NODES))
+    wide, deep = high_x - low_x, high_y - low_y  # of a long map one row of nodes may be all
+    spacing = max(_SPACING_M, math.sqrt(wide * deep / _MOST_NODES), max(wide, deep) / _MOST_NODES)
     shape = (int((high_x - low_x) / spacing) + 1, int((high_y - low_y) / spacing) + 1)
     corner = (low_x + 0.5 * ((high_x - low_x) - (shape[0] - 1) * spacing),
               low_y + 0.5 * ((high_y - low_y) - (shape[1] - 1) * spacing))  # fmt: skip

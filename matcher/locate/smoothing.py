@@ -61,7 +61,7 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
             continue
         poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
         for k, pose, around in zip(own[~used], poses[~used], covariance[~used], strict=True):
-            if found[k].reason in ("ambiguous", "poor fit"):
+            if found[k].reason in ("ambiguous", "poor fit", "unexpected"):
                 zones = locator.zones(recording, int(k))
                 again = locator.locate_scan(recording.scan(int(k)), (pose, around + part), zones)
                 if again.accepted:

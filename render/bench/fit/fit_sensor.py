@@ -91,8 +91,8 @@ def fit_sensor(
     ------
     UsageError
         Numbers of frames, distances, albedos and standard deviations do not fit; there are too few frames; no pixel is
-        valid often enough; a board is farther than 20 m, or tilted by more than 3°; a standard deviation is negative or
-        more than a tenth of its distance.
+        valid often enough; a board is farther than 20 m, or tilted by more than 3°; the mean error of one is far from
+        those of the others; a standard deviation is negative or more than a tenth of its distance.
     """
     base.refuse_several_frequencies("a fit")
     if len(frames) != len(distance_m) or not frames:

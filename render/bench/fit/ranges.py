@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, special
 
+from phasemark import UsageError
 from phasemark.render.bench.fit.boards import DEAD_SHARE, BoardData
 from phasemark.render.bench.fit.fitted_sensor import Findings, Floats
 from phasemark.render.bench.least_squares import weighted_fit
@@ -46,6 +47,7 @@ def fit_offsets(data: BoardData, found: Findings) -> None:
     # an error of the distance is one of the mean; its lever on the wiggling's phase is small beside that
     std = np.maximum(np.hypot(temporal, data.distance_std_m * (truth / data.distance_m[:, None]).mean(axis=1)), 1e-9)
     m, known = len(mean), base.correlation_harmonics
+    _check_distances(data, mean, std)
 
     def fitted(orders: tuple[int, ...]) -> tuple[float, float, list[tuple[Harmonic, float]]]:
         """Return the offset with its error, and each order with the error of its amplitude."""
@@ -103,6 +105,18 @@ def fit_offsets(data: BoardData, found: Findings) -> None:
             f"Offset and wiggling cannot be distinguished from {where}: that takes at least "
             f"{2 + 2 * len(_WIGGLING_ORDERS[-1])}, spread over {base.unambiguous_range_m / 4:.3g} m, one period of the "
             "wiggling. The modulation is the assumed one."
+        )
+
+
+def _check_distances(data: BoardData, mean: Floats, std: Floats) -> None:
+    """Refuse boards whose mean errors, (m,), differ by more than wiggling makes them."""
+    most_m = 0.1 if data.sensor.kind == "direct" else 0.1 * data.sensor.metres_per_radian
+    off = wrap_difference_m(mean - np.median(mean), data.sensor)
+    k = int(np.argmax(np.abs(off) - 6.0 * std))
+    if abs(off[k]) > most_m + 6.0 * std[k]:
+        raise UsageError(
+            f"the board at {data.distance_m[k]:g} m measures {off[k]:+.2g} m off what the others do: is its distance"
+            " right, and are the distances in the order of the files?"
         )
 
 
