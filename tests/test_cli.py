@@ -252,7 +252,7 @@ def test_long_work_writes_lines_where_stderr_is_no_terminal(run, monkeypatch, tm
 
     monkeypatch.setattr("phasemark.cli.typer.echo", echo)
     for name in (
-        "data.build_bank", "data.build_frames", "matcher.sweep.run.run_sweep", "matcher.design.run_design",
+        "data.build_bank", "data.build_frames", "matcher.sweep.run_sweep", "matcher.design.run_design",
         "matcher.drive.run_drive", "render.characterise",
     ):  # fmt: skip
         monkeypatch.setattr(f"phasemark.{name}", work)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from phasemark import UsageError
 from phasemark.data.commands.build import build_or_estimate, merge_shards
-from phasemark.data.commands.command import Shown
+from phasemark.data.commands.command import Shown, refuse_options
 from phasemark.data.commands.console import echo_facts, tell
 from phasemark.data.commands.inputs import name_and_file, open_any_bank
 from phasemark.data.commands.options import (
@@ -91,6 +91,8 @@ def bank_build(
 
     if plan_file is not None and str(plan_file) in catalog():
         raise UsageError(f"'{plan_file}' is a class of the catalogue, not a plan: give --class {plan_file}")
+    if not meshes:
+        refuse_options("only with --mesh", ("unit", "up", "origin", "symmetry"))
     plan = BankPlan() if plan_file is None else read_bank_plan(plan_file)
     layout_stated = full or "layout" in plan.model_fields_set
     options: dict[str, Any] = {

@@ -13,7 +13,7 @@ other words than the group does.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextvars import ContextVar
 from dataclasses import MISSING, fields, is_dataclass
 from functools import wraps
@@ -24,6 +24,8 @@ from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
 import typer
 from typer.core import TyperCommand
 
+from phasemark import UsageError
+
 _DESCRIPTION = re.compile(r"^(\w+)\n((?: +.+\n?)+)", re.MULTILINE)
 """A parameter in a docstring, and its description."""
 _SUFFIX = re.compile(r"(?<!_or)_(?:file|name)$|_$")
@@ -33,6 +35,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 OUTPUTS = ("out", "plot", "picture", "estimates", "to")
 """Parameters of commands that name what is written; all other files that a command is given are read."""
 
+options_given: ContextVar[dict[str, str]] = ContextVar("options", default={})  # noqa: B039  it is replaced, not changed
+"""The options that the running command was given, flags by names of parameters."""
 inputs_given: ContextVar[tuple[Path, ...]] = ContextVar("inputs", default=())
 """The files that the running command was given to read."""
 
@@ -53,7 +57,30 @@ class _Command(TyperCommand):
 
         given = {name: value for name, value in ctx.params.items() if name not in OUTPUTS}
         inputs_given.set(tuple(named_files(given)))
+        stated = [one for one in self.params if ctx.get_parameter_source(one.name).name == "COMMANDLINE"]
+        options_given.set({str(one.name): one.opts[0] for one in stated if one.opts[0].startswith("-")})
         return super().invoke(ctx)
+
+
+def refuse_options(because: str, names: Iterable[str] | None = None, *, but: Iterable[str] = ()) -> None:
+    """Refuse options that were given to the running command and that nothing is done with.
+
+    Parameters
+    ----------
+    because : str
+        Why: "only with --start".
+    names : iterable of str, optional
+        Parameters to refuse; None: all.
+    but : iterable of str
+        Parameters that are not refused.
+
+    Raises
+    ------
+    UsageError
+    """
+    flags = [flag for name, flag in options_given.get().items() if name not in but and (names is None or name in names)]
+    if flags:
+        raise UsageError(f"{', '.join(flags)}: {because}")
 
 
 class Commands(typer.Typer):

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Protocol
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.commands.command import Shown
+from phasemark.data.commands.command import Shown, refuse_options
 from phasemark.data.commands.console import tell
 from phasemark.data.commands.options import ClassName, MeshReading, MeshUnit, Origin, Up
 from phasemark.inputs.numbers import in_words
@@ -109,6 +109,8 @@ class ClassOrMesh:
             raise UsageError(f"say what to {doing}: either --class NAME or --mesh NAME=FILE")
         if self.class_name is not None and self.unit is not None:
             raise UsageError("--unit belongs to --mesh: the catalogue is in metres")
+        if self.class_name is not None:
+            refuse_options("only with --mesh: classes of the catalogue have their own axes", ("up", "origin"))
 
     def read(self) -> tuple[str, SurfaceMesh]:
         """Return name and mesh."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.commands.command import Shown
+from phasemark.data.commands.command import Shown, refuse_options
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable
 from phasemark.data.commands.flag_wording import in_flags
 from phasemark.data.commands.inputs import background_to_estimate, class_mesh, note_too_far, open_any_bank, read_sensor
@@ -44,6 +44,9 @@ if TYPE_CHECKING:
     from phasemark.render import Frames, Sensor
 
 Names = Annotated[str, Shown(metavar="NAMES")]
+
+_OF_RIG = "poses", "out", "free", "rig_file", "map_file", "as_json", "write_distrusted", "force"
+"""Parameters that count with a rig."""
 
 
 def calibrate_camera(
@@ -152,7 +155,7 @@ def calibrate_camera(
     from phasemark.matcher.calibration.known_poses import read_poses
 
     if rig_file is not None:
-        _refuse_with_rig(fix, sensor, reading)
+        refuse_options("not with --rig: nothing of the kind is asked of its sensors", but=_OF_RIG)
         files, chosen = [Path(bank_or_class), *(frames or ())], None if free is None else _names(free)
         return calibrate_rig_file(rig_file, map_file, files, poses, chosen, out, write_distrusted, force, as_json)
     if not frames:
@@ -187,12 +190,6 @@ def calibrate_camera(
             progress=progress,
         )
     _write_calibration(found, out, figure, base_name, force, write_distrusted, as_json)
-
-
-def _refuse_with_rig(fix: str | None, sensor: str | None, reading: FrameReading) -> None:
-    """Refuse what says nothing of the sensors of a rig."""
-    if fix is not None or sensor is not None or reading != FrameReading():
-        raise UsageError("--fix, --sensor and options of how frames are read do not go with --rig")
 
 
 def _pose_std(position: float | None, heading_deg: float | None, delta_deg: float | None) -> PoseStd | None:

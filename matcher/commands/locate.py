@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from phasemark import InputFileError, UsageError
-from phasemark.data.commands.command import Shown
+from phasemark.data.commands.command import Shown, refuse_options
 from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table
 from phasemark.data.commands.options import Count, Degrees, Force, Json, Metres, Out
 from phasemark.data.commands.outputs import refuse_existing, refuse_other_files, write_figure, write_file
@@ -90,6 +90,8 @@ def locate_rig(
     from phasemark.matcher.locate.pose_table import pose_csv
     from phasemark.matcher.locate.wall_map import map_of_run
 
+    if start is None and not odometry:
+        refuse_options("only with --start or --odometry", ("start_std", "start_yaw_std"))
     refuse_other_files(out, ".csv", "the table")
     if plot is not None:
         refuse_other_files(plot, ".png")

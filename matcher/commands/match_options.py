@@ -345,10 +345,11 @@ class Place:
         if self.prior_std is not None and not min(self.prior_std) > 0:
             x, heading = self.prior_std
             raise UsageError(f"--prior-std must be two positive numbers, got {x:g} {heading:g}")
-        if self.landmark_xy is not None and not all(map(math.isfinite, (*self.landmark_xy, self.landmark_yaw))):
-            x, y = self.landmark_xy
+        x, y = self.landmark_xy or (0.0, 0.0)
+        if not all(map(math.isfinite, (x, y, self.landmark_yaw, self.pan))):
             raise UsageError(
-                f"--landmark-xy and --landmark-yaw must be finite numbers, got {x:g} {y:g} and {self.landmark_yaw:g}"
+                f"--landmark-xy, --landmark-yaw and --pan must be finite numbers, got {x:g} {y:g},"
+                f" {self.landmark_yaw:g} and {self.pan:g}"
             )
 
     @property
