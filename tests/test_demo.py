@@ -35,7 +35,7 @@ def made(tmp_path_factory):
     """What the command printed, and its folder."""
     folder, printed = tmp_path_factory.mktemp("demo") / "out", io.StringIO()
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed):
-        patch.setattr("phasemark.matcher.sweep.plan.read_sweep_plan", lambda name: small(name=name))
+        patch.setattr("phasemark.matcher.sweep.read_sweep_plan", lambda name: small(name=name))
         patch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 2)  # a picture takes half a second
         assert main(["demo", "--out", str(folder), "--seed", "7", "--workers", "1"]) == 0
     return SimpleNamespace(folder=folder, printed=printed.getvalue(), trials=read_sweep(folder)[1])
