@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 from phasemark.render.view import FARTHEST_M, Footprint, Views
 
 BOUNCES = 4
@@ -203,7 +203,7 @@ def _extremes(
     return farthest, -landmark.lowest_m - views.height_m
 
 
-@kernel
+@inner
 def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return which plane a ray meets first: 1 the wall, 2 the floor, 0 neither; see :func:`background_hit`."""
     forward, plane, t = dx * cos_b + dy * sin_b, 0, 0.0
@@ -214,7 +214,7 @@ def nearer_plane(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyp
     return plane
 
 
-@kernel
+@inner
 def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the result of :func:`background_hit` for one plane, whether it is the nearer one or not."""
     forward = dx * cos_b + dy * sin_b
@@ -225,7 +225,7 @@ def hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz):  # type: ignore[n
     return 0.0, 0.0, 0.0
 
 
-@kernel
+@inner
 def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of a ray at which it meets the nearer plane, its albedo, and cos θ times the ray's length.
 
@@ -236,7 +236,7 @@ def background_hit(parameters, cos_b, sin_b, dx, dy, dz):  # type: ignore[no-unt
     return hit_of_plane(parameters, plane, cos_b, sin_b, dx, dy, dz)
 
 
-@kernel
+@inner
 def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped-def]
     """Return the line where wall and floor meet, or the floor's horizon, as (tx, ty, tz): tx + ty · y + tz · z = 0.
 
@@ -253,7 +253,7 @@ def background_line(parameters, cos_b, sin_b, level):  # type: ignore[no-untyped
     return tx, ty, tz
 
 
-@kernel
+@inner
 def background_edge(parameters, cos_b, sin_b, level, camera, out):  # type: ignore[no-untyped-def]
     """Project the line where wall and floor meet, or the floor's horizon, across the image.
 

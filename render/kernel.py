@@ -23,5 +23,11 @@ if hasattr(CPUTargetOptions, "_nrt"):
 kernel = njit(**_BORROWING)
 """Compile a function that allocates nothing; floats divide as numpy's do."""
 
+inner = njit(**_BORROWING, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+"""Compile a function that compiled ones call and Python never does, which would end the process.
+
+A way in from Python takes a quarter of the time to compile, most of it for tuples of arrays.
+"""
+
 inlined = njit(**_BORROWING, inline="always")
 """Compile a function as a part of its one caller: numba optimises what is called again in every caller."""

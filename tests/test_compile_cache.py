@@ -14,7 +14,9 @@ from phasemark.cli import main
 from phasemark.render import compile_notes
 from phasemark.render.compiled_sources import COMPILED_SOURCES, ROOT, compiled_sources_hash
 
-_COMPILERS = ("njit", "kernel", "inlined", "_compiled", "_vectorised")
+_COMPILERS = ("njit", "kernel", "inner", "inlined", "_compiled", "_vectorised")
+
+TESTS = list((ROOT / "tests").glob("**/*.py"))
 
 
 def compiled_functions(tree: ast.Module) -> list[ast.FunctionDef]:
@@ -65,6 +67,26 @@ def test_every_file_that_compiled_code_is_made_from_is_listed():
         for name in used & set(imported):
             needed.add(imported[name].removeprefix("phasemark.").replace(".", "/") + ".py")
     assert sorted(COMPILED_SOURCES) == sorted(needed)
+
+
+def test_functions_without_a_way_in_from_python_are_named_by_compiled_ones_alone():
+    """Calling one from Python ends the process."""
+    trees = {path: ast.parse(path.read_text(encoding="utf-8")) for path in [*ROOT.glob("[rm]*/**/*.py"), *TESTS]}
+    inner = {
+        (".".join(["phasemark", *path.relative_to(ROOT).with_suffix("").parts]), one.name)
+        for path, tree in trees.items()
+        for one in compiled_functions(tree)
+        if any(ast.unparse(by) == "inner" for by in one.decorator_list)
+    }
+    assert len(inner) > 100
+    for path, tree in trees.items():
+        own = ".".join(["phasemark", *path.relative_to(ROOT).with_suffix("").parts])
+        known = {name for module, name in inner if module == own}
+        known |= {name for name, module in imported_names(tree).items() if (module, name) in inner}
+        for one in compiled_functions(tree):
+            one.body = []
+        used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+        assert not used & known, path
 
 
 def test_the_hash_of_the_sources_is_quick():

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 LEAST_COUNT = 1e-3
 """No bin is expected to count less: what a model gets wrong must not become infinitely improbable."""
@@ -76,7 +76,7 @@ def doubtful_deviance(mean: float, variance: float, free: int, false_alarm: floa
     return float(special.chdtri(2 * mean**2 / variance, false_alarm)) * variance / (2 * mean)
 
 
-@kernel
+@inner
 def log_term(n, mean):  # type: ignore[no-untyped-def]
     """Return the deviance of one count."""
     return 2.0 * (mean - n + (n * math.log(n / mean) if n > 0.0 else 0.0))

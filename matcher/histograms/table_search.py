@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.histograms.histogram_table import STATISTICS, Table, signal_between
 from phasemark.matcher.histograms.poisson_fit import LEAST_COUNT, log_term
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 DESCENT_MARGIN = 100.0
 """A descent that cannot come within this of the best one is given up."""
@@ -355,7 +355,7 @@ def _costs_before(  # type: ignore[no-untyped-def]
                     scales[c, i, j, a] = best[a]
 
 
-@kernel
+@inner
 def _least(normal, best):  # type: ignore[no-untyped-def]
     """Fill the brightness of each surface that explains a frame best; returns by how much that lowers the cost.
 

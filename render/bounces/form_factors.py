@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 
 def triangle_form_factors(
@@ -37,7 +37,7 @@ def _fill(points, normals, triangles, out):  # type: ignore[no-untyped-def]
         out[k] = triangle_form_factor(points[k], normals[k], triangles[k], 1.0)
 
 
-@kernel
+@inner
 def triangle_form_factor(point, normal, triangle, side):  # type: ignore[no-untyped-def]
     """Return the form factor of one triangle by Lambert's formula; `side` −1: light leaves its back.
 
@@ -69,7 +69,7 @@ def triangle_form_factor(point, normal, triangle, side):  # type: ignore[no-unty
     return max(-side * total, 0.0) / (2.0 * math.pi)
 
 
-@kernel
+@inner
 def _edge_term(ax, ay, az, bx, by, bz, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Return the angle that an edge subtends times the cosine between the normal of its plane and n."""
     cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx

@@ -13,7 +13,7 @@ from phasemark import UsageError
 from phasemark.render.bounces.form_factors import triangle_form_factor
 from phasemark.render.bounces.patches import POINTS, Patches
 from phasemark.render.bounces.slopes import Slopes, slopes_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 _CLOSE = 3.0
 """Patches nearer to one another than this many of their sizes take the closed form of their facets."""
@@ -219,7 +219,7 @@ def _sum_seen(begin, along, pair, share, facet, normals, corners, visible):  # t
         visible[p] = seen / total
 
 
-@kernel
+@inner
 def _kernel(p, n, q, m):  # type: ignore[no-untyped-def]
     """Return cos θ cos θ' / (π d²) between a point p with normal n and q with normal m."""
     x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
@@ -285,7 +285,7 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far,
     return count, count_near
 
 
-@kernel
+@inner
 def _fill_moment(i, j, geometry, of_one, of_other, moment):  # type: ignore[no-untyped-def]
     """Write the moments of a pair: of the kernel between its points, in units of `of_one` and `of_other`."""
     points, normals, weights, centre, _, _, _ = geometry
@@ -299,7 +299,7 @@ def _fill_moment(i, j, geometry, of_one, of_other, moment):  # type: ignore[no-u
                 moment[1, axis] += of_other * pair * (points[i, k, axis] - centre[i, axis])
 
 
-@kernel
+@inner
 def _closely(i, j, geometry, polygons):  # type: ignore[no-untyped-def]
     """Return the mean form factor of patch j at the points of patch i, from the closed form of the facets of j.
 

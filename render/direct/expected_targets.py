@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.targets import _median, place_to_range
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor.sensor import Sensor
 
 MARGIN = 2.0
@@ -74,7 +74,7 @@ def expected_targets(counts: NDArray[np.float64], sensor: Sensor) -> ExpectedTar
     return ExpectedTargets(distance.reshape(out), (spread.reshape(shape) * slope).reshape(out), sure.reshape(out))
 
 
-@kernel
+@inner
 def _estimate(row, level, top, centroid, reach):  # type: ignore[no-untyped-def]
     """Return where the chip sees a target whose highest bin is given, bins."""
     if centroid:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render.integral.arguments import Camera
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor.histogram_fields import Histogram
 from phasemark.render.sensor.sensor import Sensor
 
@@ -171,7 +171,7 @@ def footprint_areas(zones: Footprints) -> NDArray[np.float64]:
     return areas
 
 
-@kernel
+@inner
 def border_profile(offset, half, blur):  # type: ignore[no-untyped-def]
     """Return a zone's profile at a distance from its centre: 1 inside, 0 outside, an error function between."""
     if blur <= 0.0:
@@ -179,13 +179,13 @@ def border_profile(offset, half, blur):  # type: ignore[no-untyped-def]
     return 0.5 * (math.erf((offset + half) / blur) - math.erf((offset - half) / blur))
 
 
-@kernel
+@inner
 def footprint_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
     """Return how strongly zone k sees the direction (1, y, z), light included."""
     return border_weight(zones, k, y, z) * light_weight(zones, y, z)
 
 
-@kernel
+@inner
 def border_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
     """Return the share of the direction (1, y, z) that zone k sees, whatever light falls there."""
     dy, dz = y - zones.centre[k, 0], z - zones.centre[k, 1]
@@ -194,7 +194,7 @@ def border_weight(zones, k, y, z):  # type: ignore[no-untyped-def]
     return border_profile(dy, zones.half[k, 0], zones.blur[0]) * border_profile(dz, zones.half[k, 1], zones.blur[1])
 
 
-@kernel
+@inner
 def light_weight(zones, y, z):  # type: ignore[no-untyped-def]
     """Return the lamp's light in the direction (1, y, z), 1 where it is brightest."""
     if zones.light[2] <= 0.0:
@@ -203,7 +203,7 @@ def light_weight(zones, y, z):  # type: ignore[no-untyped-def]
     return math.exp(-0.5 * zones.light[2] * (ly * ly + lz * lz))
 
 
-@kernel
+@inner
 def zones_along(zones, axis, cols, place):  # type: ignore[no-untyped-def]
     """Return the first column (axis 0) or row (axis 1) of zones that may see a tangent, and the one behind the last."""
     step = 1 if axis == 0 else cols

@@ -25,7 +25,7 @@ from phasemark.render.direct.footprints import (
 )
 from phasemark.render.direct.transients import PARTS, through_lens
 from phasemark.render.integral.scene_samples import FLOOR, WALL, SceneSamples
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor.sensor import Sensor
 
 _ALL_PARTS = FLOOR + 1
@@ -172,7 +172,7 @@ def _optics_of(sensor: Sensor) -> _Optics:
     return _Optics(zones, scale, footprint_areas(zones._replace(light=np.zeros(3))), response)
 
 
-@kernel
+@inner
 def _add_to_bins(light, range_m, response, zone, out):  # type: ignore[no-untyped-def]
     """Share light from one range among the bins of a zone, linearly between two phases."""
     share = response.share[min(zone, len(response.share) - 1)]

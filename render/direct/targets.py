@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.direct.footprints import histogram_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor.sensor import Sensor
 
 
@@ -112,7 +112,7 @@ def response_means(sensor: Sensor) -> list[float]:
     return means if len(means) == n else means * n
 
 
-@kernel
+@inner
 def _median(row, scratch):  # type: ignore[no-untyped-def]
     """Return the median of a histogram by Hoare's selection; `scratch` has its length and is overwritten."""
     n = len(row)

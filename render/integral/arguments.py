@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 
 class Distortion(NamedTuple):
@@ -367,7 +367,7 @@ class Sums(NamedTuple):
     state: NDArray[np.uint8]
 
 
-@kernel
+@inner
 def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the ray (1, y, z) in the landmark frame; `matrix` as in :class:`Poses`, of one view."""
     return (
@@ -377,7 +377,7 @@ def towards_landmark(matrix, y, z):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@inner
 def towards_level(level, y, z):  # type: ignore[no-untyped-def]
     """Return the ray (1, y, z) in the level camera frame; `level` as in :class:`Poses`, of one view."""
     return (

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from phasemark.render.integral.edges_in_pixels import clip
 from phasemark.render.integral.image_rays import image_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 FULL = -1
 """Number of segments that says that there is no room for more."""
@@ -36,7 +36,7 @@ TANGENTS = Plane(0.0, 0.0, -1.0, -1.0)
 """The camera whose image points are tangents: u is y, v is z."""
 
 
-@kernel
+@inner
 def start_extents(edges):  # type: ignore[no-untyped-def]
     """Make the extents of the edges empty."""
     for k in range(2):
@@ -44,7 +44,7 @@ def start_extents(edges):  # type: ignore[no-untyped-def]
         edges.extent[k, 1] = edges.extent[k, 3] = -math.inf
 
 
-@kernel
+@inner
 def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append the links of an edge.
 
@@ -117,7 +117,7 @@ def add_bent_edge(ya, za, yb, zb, start, end, limb, camera, edges, n):  # type: 
     return n + links
 
 
-@kernel
+@inner
 def _clip_to_lens(ya, za, yb, zb, lens):  # type: ignore[no-untyped-def]
     """Return the shares of a line, in tangents, between which it lies where the lens matters and does not fold."""
     low, high = clip(ya, za, yb, zb, lens.low_y, lens.low_z, lens.high_y, lens.high_z)
@@ -130,7 +130,7 @@ def _clip_to_lens(ya, za, yb, zb, lens):  # type: ignore[no-untyped-def]
     return max(low, (-b - root) / a), min(high, (-b + root) / a)
 
 
-@kernel
+@inner
 def _count_links(ya, za, dy, dz, ua, va, ub, vb, camera):  # type: ignore[no-untyped-def]
     """Return how many links the image of a line needs, from its second differences across its chord."""
     du, dv = ub - ua, vb - va

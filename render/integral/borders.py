@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.quadrature_rules import G2W, G2X, G3W, G3X
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 _THIN = 1e-4
 """An edge that crosses a strip thinner than this (pixels) runs nearly along x: :func:`_place_level` handles it."""
@@ -19,7 +19,7 @@ _SHORT, _LONG = 0.1, 0.5
 """Pieces of an edge up to the first (pixels) get one point, up to the second two, longer ones three."""
 
 
-@kernel
+@inner
 def place_borders(strip, box, scratch, borders):  # type: ignore[no-untyped-def]
     """Place points on the curves of a strip whose intervals have been sampled; see :class:`Borders`.
 
@@ -53,7 +53,7 @@ def place_borders(strip, box, scratch, borders):  # type: ignore[no-untyped-def]
     scratch.last_strip[0], scratch.last_strip[1] = k, slabs[last, 1]
 
 
-@kernel
+@inner
 def _node(nodes, g):  # type: ignore[no-untyped-def]
     """Return place and weight of a Gauss point on [0, 1]."""
     if nodes == 1:
@@ -63,7 +63,7 @@ def _node(nodes, g):  # type: ignore[no-untyped-def]
     return G3X[g], G3W[g]
 
 
-@kernel
+@inner
 def _append(x, s, weight, left, right, link, sweep_v, scale, scratch, borders):  # type: ignore[no-untyped-def]
     """Append one point; `sweep_v` says that s is v, the coordinate along which the weight is a length."""
     n = borders.placed[0]
@@ -79,7 +79,7 @@ def _append(x, s, weight, left, right, link, sweep_v, scale, scratch, borders): 
     borders.along_v[n] = 1 if sweep_v else 0
 
 
-@kernel
+@inner
 def _place_level(strip, box, scratch, borders):  # type: ignore[no-untyped-def]
     """Place points on edges that lie along the border between the last strip and this one."""
     edges, found, slabs = scratch.edges, scratch.found, scratch.slabs

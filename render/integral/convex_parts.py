@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 _BEHIND = 0.01
 """Share of its way to the lens by which a point must lie behind a part to be hidden by it: edges that end at another
@@ -60,7 +60,7 @@ def enter_parts(mesh, origins, directions, near, found, distance):  # type: igno
         start = stop
 
 
-@kernel
+@inner
 def list_parts(mesh, ox, oy, oz, x, y, z, radius, farthest, near):  # type: ignore[no-untyped-def]
     """List the parts that may lie on a ray from a point through a ball.
 
@@ -97,7 +97,7 @@ def list_parts(mesh, ox, oy, oz, x, y, z, radius, farthest, near):  # type: igno
     return count
 
 
-@kernel
+@inner
 def is_hidden(mesh, lens, a, b, body, other, near):  # type: ignore[no-untyped-def]
     """Return whether one convex part, not of the two bodies that an edge belongs to, hides both of its ends.
 
@@ -144,7 +144,7 @@ def part_around(mesh, point):  # type: ignore[no-untyped-def]
     return -1
 
 
-@kernel
+@inner
 def _passes(ball, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return whether a ray passes beside a ball, or has it behind its origin."""
     x, y, z = ball[0] - ox, ball[1] - oy, ball[2] - oz
@@ -153,7 +153,7 @@ def _passes(ball, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return outside * (dx * dx + dy * dy + dz * dz) > along * abs(along)
 
 
-@kernel
+@inner
 def _enter(mesh, part, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of a ray at which it enters a part, inf where it does not, and through which face."""
     enters, leaves, face = -np.inf, np.inf, -1
@@ -179,7 +179,7 @@ def _enter(mesh, part, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     return (enters, face) if enters > 0.0 else (np.inf, -1)
 
 
-@kernel
+@inner
 def _roots(q, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return between which multiples a ray is inside a quadric; the first is larger where it is nowhere."""
     gx = q[0] * dx + q[3] * dy + q[4] * dz

@@ -13,7 +13,7 @@ from phasemark.render.background import background_edge, background_line
 from phasemark.render.integral.bent_edges import TANGENTS
 from phasemark.render.integral.edge_projection import project
 from phasemark.render.integral.image_rays import rates_of, ray_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 
 @kernel
@@ -95,7 +95,7 @@ def follow_bent_borders(mesh, motion, poses, camera, borders):  # type: ignore[n
             borders.depth[b] = _depth_on(shifted[0], y, z, depth_a, depth_b)
 
 
-@kernel
+@inner
 def _depth_on(line, x, y, depth_a, depth_b):  # type: ignore[no-untyped-def]
     """Return the depth of an edge beside a point, from the depths of its ends."""
     dx, dy = line[2] - line[0], line[3] - line[1]
@@ -104,7 +104,7 @@ def _depth_on(line, x, y, depth_a, depth_b):  # type: ignore[no-untyped-def]
     return 1.0 / ((1.0 - share) / depth_a + share / depth_b)
 
 
-@kernel
+@inner
 def _distance(line, by_normal, y, z, y_s, z_s):  # type: ignore[no-untyped-def]
     """Return how far a ray lies from a line, in tangents, and how fast that changes along a way through the image.
 
@@ -120,14 +120,14 @@ def _distance(line, by_normal, y, z, y_s, z_s):  # type: ignore[no-untyped-def]
     return away, along
 
 
-@kernel
+@inner
 def _depth(mesh, poses, pose, vertex):  # type: ignore[no-untyped-def]
     """Return how far a vertex lies along the camera's axis."""
     matrix, corner = poses.matrix[pose], mesh.vertices[vertex]
     return matrix[0, 0] * corner[0] + matrix[0, 1] * corner[1] + matrix[0, 2] * corner[2] + poses.offset[pose, 0]
 
 
-@kernel
+@inner
 def _crossing(segment, s, along_v):  # type: ignore[no-untyped-def]
     """Return where the line of a segment meets the line at s across the sweep."""
     i = 1 if along_v else 0

@@ -19,10 +19,10 @@ from phasemark.render.integral.arguments import HIDDEN_LIMB, SLENDER
 from phasemark.render.integral.bent_edges import FULL, TANGENTS, add_bent_edge, start_extents
 from phasemark.render.integral.convex_parts import is_hidden, list_parts
 from phasemark.render.integral.round_edges import BALL, RIM, TUBE, arc_of, before_rim, is_slender, segments_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 
-@kernel
+@inner
 def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-def]
     """Project the creases and silhouettes of one view.
 
@@ -54,14 +54,14 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     for part in range(len(every)):
         every[part] = part
     for e in range(len(creases)):
-        start, end, face, other = creases[e, 0], creases[e, 1], creases[e, 2], creases[e, 3]
+        start, end, face, other = np.int64(creases[e, 0]), np.int64(creases[e, 1]), creases[e, 2], creases[e, 3]
         # a closed shell hides what turns its back, and a valley from everywhere but between its slopes
         if mesh.closed[face]:
             before = _is_before(mesh, face, start, lens) or _is_before(mesh, face, end, lens)
             before_other = _is_before(mesh, other, start, lens) or _is_before(mesh, other, end, lens)
             if not (before or before_other) or (concave[e] and not (before and before_other)):
                 continue
-        body, beside = mesh.part[face], mesh.part[other if other >= 0 else face]
+        body, beside = np.int64(mesh.part[face]), np.int64(mesh.part[other if other >= 0 else face])
         if is_hidden(mesh, lens, vertices[start], vertices[end], body, beside, every):
             continue
         n = _add_edge(vertices, start, end, crease, matrix, offset, camera, edges, n)
@@ -83,9 +83,11 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
                 continue
             before = heights[i] > 0.0
             for e in range(mesh.first_fold[first + i], mesh.first_fold[first + i + 1]):
-                if before == (_smooth_height(smooth_planes, folds[e, 2], lens) > 0.0):
+                if before == (_smooth_height(smooth_planes, np.int64(folds[e, 2]), lens) > 0.0):
                     continue
-                a, b = (folds[e, 0], folds[e, 1]) if before else (folds[e, 1], folds[e, 0])
+                a, b = np.int64(folds[e, 0]), np.int64(folds[e, 1])
+                if not before:
+                    a, b = b, a
                 begin_of_fold = n
                 n = _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n)
                 if n < 0:
@@ -101,7 +103,7 @@ def project_edges(mesh, poses, view, camera, edges):  # type: ignore[no-untyped-
     return n
 
 
-@kernel
+@inner
 def _seen(first, stop, edges):  # type: ignore[no-untyped-def]
     """Return where the segments of a curve stop, or their first where all of them are hidden."""
     for k in range(first, stop):
@@ -110,14 +112,14 @@ def _seen(first, stop, edges):  # type: ignore[no-untyped-def]
     return first
 
 
-@kernel
+@inner
 def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append what is seen of a round edge; return how many segments there are, or :data:`FULL`."""
     arc = edges.arc
     begin, end = arc_of(curve, lens, arc)
     if begin == end:
         return n
-    near = edges.near[: _list_before(mesh, curve, lens, edges.near)]
+    near, body = edges.near[: _list_before(mesh, curve, lens, edges.near)], np.int64(curve[13])
     if curve[0] == TUBE:
         for angle in (begin, end):
             for k in range(3):
@@ -125,22 +127,22 @@ def _add_curve(mesh, curve, lens, matrix, offset, camera, edges, n):  # type: ig
                 edges.points[0, k] = arc[0, k] + across - curve[10 + k]
                 edges.points[1, k] = arc[0, k] + across + curve[10 + k]
             left = _turns_left(edges.points, arc, lens)
-            n = _add_segment(mesh, lens, curve[13], np.int64(1), left, near, matrix, offset, camera, edges, n)
+            n = _add_segment(mesh, lens, body, np.int64(1), left, near, matrix, offset, camera, edges, n)
             if n < 0:
                 return FULL
         return n
     first = n
-    n = _add_arc(mesh, begin, end, curve[13], curve[0] >= BALL, lens, near, matrix, offset, camera, edges, n)
+    n = _add_arc(mesh, begin, end, body, curve[0] >= BALL, lens, near, matrix, offset, camera, edges, n)
     if curve[0] == BALL and is_slender(curve):
         for k in range(first, n):
             edges.body[k] += SLENDER
     whole = 2.0 * math.pi
     if curve[0] == RIM and n >= 0 and end - begin < whole and before_rim(curve, lens):
-        n = _add_arc(mesh, end, begin + whole, curve[13], False, lens, near, matrix, offset, camera, edges, n)
+        n = _add_arc(mesh, end, begin + whole, body, np.bool_(False), lens, near, matrix, offset, camera, edges, n)
     return n
 
 
-@kernel
+@inner
 def _list_before(mesh, curve, lens, near):  # type: ignore[no-untyped-def]
     """List the convex parts that may hide some of a round edge in `near`; return how many there are."""
     square_u, square_v, square_w, away = 0.0, 0.0, 0.0, 0.0
@@ -152,7 +154,7 @@ def _list_before(mesh, curve, lens, near):  # type: ignore[no-untyped-def]
     return list_parts(mesh, lens[0], lens[1], lens[2], x, y, z, radius, math.sqrt(away) + radius, near)
 
 
-@kernel
+@inner
 def _add_arc(mesh, begin, end, body, is_limb, lens, near, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append an arc of the ellipse at hand as a chain that has its area and its ends."""
     arc, points = edges.arc, edges.points
@@ -182,7 +184,7 @@ def _add_arc(mesh, begin, end, body, is_limb, lens, near, matrix, offset, camera
     return n
 
 
-@kernel
+@inner
 def _turns_left(points, arc, lens):  # type: ignore[no-untyped-def]
     """Return whether the centre of an ellipse lies on the left of the way from one point to the other, as seen."""
     ax, ay, az = points[0, 0] - lens[0], points[0, 1] - lens[1], points[0, 2] - lens[2]
@@ -191,7 +193,7 @@ def _turns_left(points, arc, lens):  # type: ignore[no-untyped-def]
     return (ay * bz - az * by) * cx + (az * bx - ax * bz) * cy + (ax * by - ay * bx) * cz > 0.0
 
 
-@kernel
+@inner
 def _add_segment(mesh, lens, body, limb, left, near, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append a segment of a round edge, whose surface is on its left or on its right."""
     if is_hidden(mesh, lens, edges.points[0], edges.points[1], body, body, near):
@@ -209,7 +211,7 @@ def _add_segment(mesh, lens, body, limb, left, near, matrix, offset, camera, edg
     return n
 
 
-@kernel
+@inner
 def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append the image of the edge between two vertices; return how many segments there are."""
     if camera.distortion.model != 0:
@@ -223,7 +225,7 @@ def _add_edge(vertices, a, b, limb, matrix, offset, camera, edges, n):  # type: 
     return n
 
 
-@kernel
+@inner
 def _is_before(mesh, f, vertex, lens):  # type: ignore[no-untyped-def]
     """Return whether the lens is before the front of a face, a round one at the vertex."""
     planes, x, y, z = mesh.planes, lens[0], lens[1], lens[2]
@@ -236,13 +238,13 @@ def _is_before(mesh, f, vertex, lens):  # type: ignore[no-untyped-def]
     return nx * (x - p[0]) + ny * (y - p[1]) + nz * (z - p[2]) > 0.0
 
 
-@kernel
+@inner
 def _smooth_height(planes, i, lens):  # type: ignore[no-untyped-def]
     """Return the same for a smooth face; `planes` has a row for each number, not for each face."""
     return planes[0, i] * lens[0] + planes[1, i] * lens[1] + planes[2, i] * lens[2] - planes[3, i]
 
 
-@kernel
+@inner
 def project(vertices, a, b, matrix, offset, camera, segment):  # type: ignore[no-untyped-def]
     """Project the edge between two vertices into `segment` (4,); return whether any of it lies before the camera.
 

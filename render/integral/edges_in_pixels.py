@@ -5,13 +5,13 @@ from __future__ import annotations
 import math
 
 from phasemark.render.integral.arguments import HIDDEN_LIMB
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 MAX_SEGMENTS = 128
 """Edges in a box above which it is quartered rather than swept: crossings are searched pair by pair."""
 
 
-@kernel
+@inner
 def bin_segments(n_segments, camera, edges):  # type: ignore[no-untyped-def]
     """List the segments of every pixel, with a border of one pixel around the image.
 
@@ -61,7 +61,7 @@ def bin_segments(n_segments, camera, edges):  # type: ignore[no-untyped-def]
     return n
 
 
-@kernel
+@inner
 def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     """Return the shares (lo, hi) of a segment between which it lies in a box; lo ≥ hi where it does not."""
     du, dv = ub - ua, vb - va
@@ -76,7 +76,7 @@ def clip(ua, va, ub, vb, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     return lo, hi
 
 
-@kernel
+@inner
 def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Clip a pixel's segments to a box, into ``scratch.edges``.
 
@@ -126,7 +126,7 @@ def clip_to_box(entry, edges, u0, v0, u1, v1, sweep_v, scratch):  # type: ignore
     return m
 
 
-@kernel
+@inner
 def edge_at(edges, i, s):  # type: ignore[no-untyped-def]
     """Return where an edge meets the line at `s`."""
     return edges[i, 1] + (s - edges[i, 0]) * edges[i, 5]

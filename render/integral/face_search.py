@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import inlined, inner, kernel
 
 _MOST_CELLS = 1 << 18
 """Of the grid."""
@@ -127,7 +127,7 @@ def _spread(faces, distance):  # type: ignore[no-untyped-def]
                             distance[i, j, k], faces[i, j, k] = distance[x, y, z] + 1.0, faces[x, y, z]
 
 
-@kernel
+@inner
 def _face_about(grid, x, y, z):  # type: ignore[no-untyped-def]
     """Return a face near a point, −1 where there is none at all."""
     cells = grid.faces
@@ -138,7 +138,7 @@ def _face_about(grid, x, y, z):  # type: ignore[no-untyped-def]
     return cells[int(i), int(j), int(k)]
 
 
-@kernel
+@inner
 def plane_hit(search, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of a ray at which it meets the plane of a face; 0 for a ray along it."""
     face = search[f]
@@ -158,7 +158,7 @@ def look_about(search, grid, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-unty
     return g if g >= 0 and search[g, 15] == face[15] else f
 
 
-@kernel
+@inner
 def find_face(search, grid, start, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the face of a smooth patch that a ray meets, and the multiple of the ray there; (−1, 0) if none is found.
 

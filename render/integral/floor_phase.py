@@ -10,13 +10,13 @@ import math
 from phasemark.render.background import background_hit
 from phasemark.render.integral.arguments import towards_level
 from phasemark.render.integral.image_rays import ray_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 _DARK = 2e-6
 """Amplitude, 1 being albedo 1 facing at 1 m, below which the phase of a pixel does not matter."""
 
 
-@kernel
+@inner
 def parts_of_pixel(r, c, background, fastest, cos_b, sin_b, level, camera):  # type: ignore[no-untyped-def]
     """Return into how many parts along u and along v a pixel is to be cut for the sake of the background's phase.
 
@@ -45,7 +45,7 @@ def parts_of_pixel(r, c, background, fastest, cos_b, sin_b, level, camera):  # t
     return _parts(fastest * along_u), _parts(fastest * along_v)
 
 
-@kernel
+@inner
 def _corner(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-untyped-def]
     """Return how far the background behind an image point is, inf where there is none, and its amplitude."""
     y, z = ray_of(camera, u, v)
@@ -58,7 +58,7 @@ def _corner(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-u
     return distance, albedo * facing / (length * distance * distance)
 
 
-@kernel
+@inner
 def _recedes(one, other):  # type: ignore[no-untyped-def]
     """Return how much the range changes between two points, as far as the light is worth it.
 
@@ -68,7 +68,7 @@ def _recedes(one, other):  # type: ignore[no-untyped-def]
     return min(abs(other - one), near) if near < math.inf else 0.0
 
 
-@kernel
+@inner
 def _parts(turn):  # type: ignore[no-untyped-def]
     """Return how many parts a turn of the phase takes."""
     per_part_rad = 1.0  # turn of the phase that two Gauss points a side integrate

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.render.integral.light import landmark_hit
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 _PER_BOX, _PER_BOX_OF_LOBE = 0.7, 1.5
 """By how many of the lobe's widths, 1 / √m, the normal may turn over a box: in general, and where several boxes see a
@@ -74,7 +74,7 @@ def count_highlight_boxes(n, samples, mesh, poses, camera, least):  # type: igno
         own[0], own[1] = max(own[0], boxes), max(own[1], boxes)
 
 
-@kernel
+@inner
 def _sine(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the sine of the angle of incidence of the ray (1, y, z) on a face."""
     _, facing = landmark_hit(mesh, face, lens, matrix, y, z)

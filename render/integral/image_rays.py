@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor import lens_map
 
 _CLOSE = 1e-7
@@ -47,7 +47,7 @@ def trace(first, stop, samples, camera):  # type: ignore[no-untyped-def]
         rays[k, 0], rays[k, 1] = _bent_ray(camera, points[k, 0], points[k, 1])
 
 
-@kernel
+@inner
 def _bent_ray(camera, u, v):  # type: ignore[no-untyped-def]
     """Return the ray of an image point of a camera with distortion."""
     lens = camera.distortion
@@ -74,14 +74,14 @@ def _bent_ray(camera, u, v):  # type: ignore[no-untyped-def]
     return y, z
 
 
-@kernel
+@inner
 def image_of(camera, y, z):  # type: ignore[no-untyped-def]
     """Return where the ray (1, y, z) of a camera with distortion meets the image: u, v."""
     x_d, y_d, _, _, _ = distort(camera.distortion.model, camera.distortion.coefficients, -y, -z)
     return camera.centre_u + camera.scale_u * x_d, camera.centre_v + camera.scale_v * y_d
 
 
-@kernel
+@inner
 def rates_of(camera, y, z):  # type: ignore[no-untyped-def]
     """Return how the ray of an image point changes along the image, with distortion: ∂y/∂u, ∂z/∂u, ∂y/∂v, ∂z/∂v."""
     _, _, xx, xy, yy = distort(camera.distortion.model, camera.distortion.coefficients, -y, -z)

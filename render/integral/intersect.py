@@ -15,7 +15,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 _DEEPEST = 128  # nodes that wait to be looked at
 MOST_SCENES = 800
@@ -157,7 +157,7 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
     bounds = np.empty((2 * n + 1, 6))
     children = np.empty((2 * n + 1, 2), np.int64)
     stack = np.empty((_DEEPEST, 3), np.int64)
-    stack[0] = (0, 0, n)
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, 0, n
     used, depth = 1, 1
     leaf = 4
     while depth > 0:
@@ -174,21 +174,21 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
                 centre_low[k] = min(centre_low[k], centre[f, k])
                 centre_high[k] = max(centre_high[k], centre[f, k])
         if stop - start <= leaf:
-            children[node] = (-1 - start, stop - start)
+            children[node, 0], children[node, 1] = -1 - start, stop - start
             continue
         axis = np.argmax(centre_high - centre_low)
         part = order[start:stop]
         order[start:stop] = part[np.argsort(centre[part, axis])]
         middle = (start + stop) // 2
-        children[node] = (used, used + 1)
-        stack[depth] = (used, start, middle)
-        stack[depth + 1] = (used + 1, middle, stop)
+        children[node, 0], children[node, 1] = used, used + 1
+        stack[depth, 0], stack[depth, 1], stack[depth, 2] = used, start, middle
+        stack[depth + 1, 0], stack[depth + 1, 1], stack[depth + 1, 2] = used + 1, middle, stop
         depth += 2
         used += 2
     return bounds[:used].copy(), children[:used].copy(), order
 
 
-@kernel
+@inner
 def _enters(bounds, node, origin, inverse, nearest):  # type: ignore[no-untyped-def]
     """Return the distance at which a ray enters a node, inf if it does not before `nearest`."""
     lo, hi = 0.0, nearest
@@ -203,7 +203,7 @@ def _enters(bounds, node, origin, inverse, nearest):  # type: ignore[no-untyped-
     return lo if lo <= hi * (1 + 1e-12) else np.inf
 
 
-@kernel
+@inner
 def _edge_side(vertices, i, j, origin, d):  # type: ignore[no-untyped-def]
     """Return on which side of the edge i → j a ray passes; exactly opposite for j → i."""
     a, b, sign = (i, j, 1.0) if i < j else (j, i, -1.0)
@@ -221,7 +221,7 @@ def _walk(  # type: ignore[no-untyped-def]
         for k in range(3):
             inverse[k] = 1.0 / d[k] if d[k] != 0 else np.inf
         nearest, found = np.inf, -1
-        stack[0], entry[0] = 0, _enters(bounds, 0, origin, inverse, np.inf)
+        stack[0], entry[0] = 0, _enters(bounds, np.int64(0), origin, inverse, np.inf)
         depth = 1
         while depth > 0:
             depth -= 1

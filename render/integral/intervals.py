@@ -16,7 +16,7 @@ from phasemark.render.integral.borders import place_borders
 from phasemark.render.integral.edges_in_pixels import edge_at
 from phasemark.render.integral.limbs import nearest_limb
 from phasemark.render.integral.quadrature_rules import FELT, MOST_POINTS, place_points
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 EMPTY = 1e-10
 """Pieces narrower than this (pixels) are not sampled."""
@@ -62,7 +62,7 @@ class Strip(NamedTuple):
     k: int
 
 
-@kernel
+@inner
 def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ignore[no-untyped-def]
     """Sample the k + 1 intervals between the k curves of a strip.
 
@@ -130,7 +130,7 @@ def sample_strip(strip, box, scratch, samples, borders, n, region):  # type: ign
     return n, region
 
 
-@kernel
+@inner
 def add_piece(pieces, first, stop, sweep_v, bounds):  # type: ignore[no-untyped-def]
     """Append a piece; there are no more of them than samples."""
     p = pieces.placed[0]
@@ -140,7 +140,7 @@ def add_piece(pieces, first, stop, sweep_v, bounds):  # type: ignore[no-untyped-
     pieces.placed[0] = p + 1
 
 
-@kernel
+@inner
 def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     """Return where, from 0 to 1, a strip of some widths at its ends and in its middle is cut, t of the pieces on.
 
@@ -156,7 +156,7 @@ def _cut(t, low, middle, high):  # type: ignore[no-untyped-def]
     return t
 
 
-@kernel
+@inner
 def _gauss_rule(lo, hi, i, strip, box, scratch, whole):  # type: ignore[no-untyped-def]
     """Return the Gauss rule for the width of an interval from `lo` to `hi` as weight.
 
@@ -210,7 +210,7 @@ def _gauss_rule(lo, hi, i, strip, box, scratch, whole):  # type: ignore[no-untyp
     return 2, m0, max(s_a, lo), min(s_b, hi), above / root
 
 
-@kernel
+@inner
 def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     """Return the ends of interval i on the line at s, which lies in a slab."""
     row, edges, links = slab * strip.k, scratch.edges, scratch.links
@@ -219,7 +219,7 @@ def _bounds(s, slab, i, strip, box, scratch):  # type: ignore[no-untyped-def]
     return a, b
 
 
-@kernel
+@inner
 def _interval(  # type: ignore[no-untyped-def]
     s, i, strip, box, scratch, seek_left, seek_right
 ):

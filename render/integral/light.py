@@ -14,7 +14,7 @@ from phasemark.render.integral.face_search import plane_hit
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.quadrature_rules import G3W, G3X, G4W, G4X
 from phasemark.render.integral.ray_plan import SKIPPED
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import inlined, inner, kernel
 
 _MOST_BOXES = 64
 
@@ -78,7 +78,7 @@ def _hit_samples(start, stop, samples, mesh, poses, camera, light, sums):  # typ
     sums.intensity[index], sums.coverage[index] = intensity, coverage
 
 
-@kernel
+@inner
 def reflected_by(mesh, face, albedo, facing, length):  # type: ignore[no-untyped-def]
     """Return the response of a face times the length of the ray; `facing` is cos θ times that length.
 
@@ -91,7 +91,7 @@ def reflected_by(mesh, face, albedo, facing, length):  # type: ignore[no-untyped
     return lambertian + albedo * length * (gloss[0] + gloss[1] * (facing / length) ** (gloss[2] + 1.0))
 
 
-@kernel
+@inner
 def _add_order(j, start, stop, samples, light, sums):  # type: ignore[no-untyped-def]
     """Add the returns of some samples to the phasor of the j-th order."""
     returns, pixel = samples.returns, samples.pixel
@@ -106,7 +106,7 @@ def _add_order(j, start, stop, samples, light, sums):  # type: ignore[no-untyped
     sums.phasor[index, j] = total
 
 
-@kernel
+@inner
 def _amplitude(distance, reflected, length, light):  # type: ignore[no-untyped-def]
     """Return the amplitude of a hit; `length` is that of the ray (1, y, z), `reflected` ρ cos θ times that length."""
     a = reflected / (length * distance * distance)
@@ -115,7 +115,7 @@ def _amplitude(distance, reflected, length, light):  # type: ignore[no-untyped-d
     return a / (length * length * length * length) if light.vignetting else a
 
 
-@kernel
+@inner
 def _lamp_intensity(lamp, step, length):  # type: ignore[no-untyped-def]
     """Return the lamp's intensity along a ray (1, y, z), whose length is given, from its table over the tangent."""
     at = min(math.sqrt(max(length * length - 1.0, 0.0)) / step, len(lamp) - 1.0)
@@ -123,7 +123,7 @@ def _lamp_intensity(lamp, step, length):  # type: ignore[no-untyped-def]
     return lamp[k] + (at - k) * (lamp[k + 1] - lamp[k])
 
 
-@kernel
+@inner
 def _add_phasor(index, distance, reflected, length, weight, light, sums):  # type: ignore[no-untyped-def]
     """Add the light of one hit to a pixel; see :func:`_amplitude`."""
     a = weight * _amplitude(distance, reflected, length, light)
@@ -133,7 +133,7 @@ def _add_phasor(index, distance, reflected, length, weight, light, sums):  # typ
         sums.phasor[index, j] += complex(a * math.cos(phase), a * math.sin(phase))
 
 
-@kernel
+@inner
 def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-def]
     """Return the light of one hit at the modulation frequency; see :func:`_amplitude`."""
     a = _amplitude(distance, reflected, length, light)
@@ -141,7 +141,7 @@ def phasor_of(distance, reflected, length, light):  # type: ignore[no-untyped-de
     return complex(a * math.cos(phase), a * math.sin(phase))
 
 
-@kernel
+@inner
 def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray (1, y, z) at its hit, and |cos θ| there times the ray's length."""
     dx, dy, dz = towards_landmark(matrix, y, z)
@@ -158,7 +158,7 @@ def landmark_hit(mesh, face, lens, matrix, y, z):  # type: ignore[no-untyped-def
     return _curved_hit(mesh, face, ox, oy, oz, dx, dy, dz)
 
 
-@kernel
+@inner
 def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit with the face's quadric, and |cos θ| there times the ray's length.
 
@@ -185,7 +185,7 @@ def _quadric_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-de
     return t, root / size
 
 
-@kernel
+@inner
 def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the multiple of the ray at its hit, and |cos θ| of the shading normal times the ray's length.
 
@@ -220,7 +220,7 @@ def _curved_hit(mesh, f, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def
     return t, max(cos_theta, 0.0)
 
 
-@kernel
+@inner
 def _range_of_background(u, v, background, cos_b, sin_b, level, camera):  # type: ignore[no-untyped-def]
     """Return the range of what stands behind an image point, 0 for nothing."""
     y, z = ray_of(camera, u, v)
@@ -229,7 +229,7 @@ def _range_of_background(u, v, background, cos_b, sin_b, level, camera):  # type
     return t * math.sqrt(1.0 + y * y + z * z)
 
 
-@kernel
+@inner
 def _boxes(c, r, width, height, background, cos_b, sin_b, level, camera, fastest):  # type: ignore[no-untyped-def]
     """Return into how many boxes a pixel is cut along its width or height, for its fastest phase to turn little."""
     u, v, half_u, half_v = c + 0.5, r + 0.5, 0.5 * width, 0.5 * height
@@ -244,7 +244,7 @@ def _boxes(c, r, width, height, background, cos_b, sin_b, level, camera, fastest
     return int(min(max(math.ceil(abs(far - near) * fastest / radians_per_box), 1.0), _MOST_BOXES))
 
 
-@kernel
+@inner
 def _add_boxes(index, c, r, n_u, n_v, background, cos_b, sin_b, level, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over one pixel, cut into boxes."""
     for i in range(4 * n_v):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from phasemark.render.integral.arguments import HIDDEN_LIMB
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 MAX_LIMBS = 256
 _REACH = 0.5
 """How far along the sweep (pixels) the end of a limb is felt."""
 
 
-@kernel
+@inner
 def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
     """Return whether a limb is among the segments listed from `entry` on."""
     while entry >= 0:
@@ -22,7 +22,7 @@ def lists_limb(entry, edges):  # type: ignore[no-untyped-def]
     return False
 
 
-@kernel
+@inner
 def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-def]
     """Append a pixel's limbs: s, x at the low end, s at the high end, slope dx/ds, body, whether it is hidden.
 
@@ -54,7 +54,7 @@ def collect_limbs(entry, edges, sweep_v, scratch):  # type: ignore[no-untyped-de
         count[which] += 1
 
 
-@kernel
+@inner
 def nearest_limb(scratch, s, side, bound, body):  # type: ignore[no-untyped-def]
     """Find, of limbs with their surface on our side, the one nearest to `bound` and beyond it, on or near a line.
 

@@ -21,7 +21,7 @@ from phasemark.render.integral.intervals import Box, add_piece
 from phasemark.render.integral.limbs import MAX_LIMBS, collect_limbs, lists_limb
 from phasemark.render.integral.quadrature_rules import G2X, G3W, G3X
 from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, find_events, sweep_box
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import inlined, inner
 
 _MAX_DEPTH = 5
 
@@ -152,7 +152,7 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
             if len(samples.pieces.samples) > 0:
                 left, top = u0 + width / splits_u * col, v0 + height / splits_v * row
                 right, bottom = left + width / splits_u, top + height / splits_v
-                add_piece(samples.pieces, n - count * count, n, True, (top, bottom, left, right, left, right))
+                add_piece(samples.pieces, n - count * count, n, np.bool_(True), (top, bottom, left, right, left, right))
         return n, region, True
     # sweep along the limb if there is one, else along where one is near, else along most of the edges
     crease_u, crease_v, limb_u, limb_v = 0.0, 0.0, 0.0, 0.0
@@ -160,7 +160,7 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
     while entry >= 0:
         k = owner[entry]
         ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
-        lo, hi = clip(ua, va, ub, vb, c, r, c + 1, r + 1)
+        lo, hi = clip(ua, va, ub, vb, float(c), float(r), c + 1.0, r + 1.0)
         du, dv = max(hi - lo, 0.0) * abs(ub - ua), max(hi - lo, 0.0) * abs(vb - va)
         if limb[k] == 1:
             limb_u, limb_v = limb_u + du, limb_v + dv
@@ -174,7 +174,7 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
         sweep_v = sideways
     elif sideways:
         for near in (head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
-            du, dv = _extent_of_limbs(near, edges, c - 1, r - 1, c + 2, r + 2)
+            du, dv = _extent_of_limbs(near, edges, c - 1.0, r - 1.0, c + 2.0, r + 2.0)
             limb_u, limb_v = limb_u + du, limb_v + dv
         sweep_v = limb_v >= limb_u
     else:
@@ -191,13 +191,9 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
     while depth > 0 or part < splits_u * splits_v:
         if depth == 0:
             row, col = divmod(part, splits_u)
-            stack[0] = (
-                u0 + width * col / splits_u,
-                v0 + height * row / splits_v,
-                u0 + width * (col + 1) / splits_u,
-                v0 + height * (row + 1) / splits_v,
-                0.0,
-            )
+            left, right = u0 + width * col / splits_u, u0 + width * (col + 1) / splits_u
+            top, bottom = v0 + height * row / splits_v, v0 + height * (row + 1) / splits_v
+            _put_box(stack, np.int64(0), left, top, right, bottom, 0.0)
             part, depth = part + 1, 1
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
@@ -209,10 +205,10 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
         n_events = find_events(box, m, scratch) if m >= 0 else -1
         if n_events < 0 and level < _MAX_DEPTH:
             um, vm = 0.5 * (bu0 + bu1), 0.5 * (bv0 + bv1)
-            stack[depth] = (bu0, bv0, um, vm, level + 1)
-            stack[depth + 1] = (um, bv0, bu1, vm, level + 1)
-            stack[depth + 2] = (bu0, vm, um, bv1, level + 1)
-            stack[depth + 3] = (um, vm, bu1, bv1, level + 1)
+            _put_box(stack, depth, bu0, bv0, um, vm, level + 1)
+            _put_box(stack, depth + 1, um, bv0, bu1, vm, level + 1)
+            _put_box(stack, depth + 2, bu0, vm, um, bv1, level + 1)
+            _put_box(stack, depth + 3, um, vm, bu1, bv1, level + 1)
             depth += 4
             continue
         if n_events < 0:
@@ -224,7 +220,13 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
     return n, region, trusted
 
 
-@kernel
+@inner
+def _put_box(stack, k, u0, v0, u1, v1, level):  # type: ignore[no-untyped-def]
+    """Write the k-th box still to be split, number by number: numba compiles a row that is set to a tuple at length."""
+    stack[k, 0], stack[k, 1], stack[k, 2], stack[k, 3], stack[k, 4] = u0, v0, u1, v1, level
+
+
+@inner
 def _extent_of_limbs(entry, edges, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
     """Return how far the limbs listed from `entry` on run along u and along v inside a box."""
     segments, along_u, along_v = edges.segments, 0.0, 0.0

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 _THIN = 0.07
 """Intervals narrower than this share of their box get one Gauss point."""
@@ -36,7 +36,7 @@ MOST_POINTS = 16
 GMX, GMW = gauss_legendre(MOST_POINTS)
 
 
-@kernel
+@inner
 def place_points(a, b, left, right, side, bent, slender, points, weights):  # type: ignore[no-untyped-def]
     """Place Gauss points on one interval [a, b], with limbs at `left` and `right` (∓inf: none).
 

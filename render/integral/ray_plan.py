@@ -14,7 +14,7 @@ from phasemark.render.integral.floor_phase import parts_of_pixel
 from phasemark.render.integral.image_rays import trace
 from phasemark.render.integral.limbs import lists_limb
 from phasemark.render.integral.pixel_splitting import sample_pixel
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 SKIPPED = 0
 """Pixel state: no sample can meet the landmark; only the background is seen."""
@@ -74,10 +74,10 @@ def plan_rays(  # type: ignore[no-untyped-def]
         n_edges = project_edges(mesh, poses, view, camera, edges)
         if n_edges < 0:
             return SHORT_SEGMENTS, n
-        u_low, u_high, v_low, v_high = _extent(edges, n_edges, False, bent_lens)
+        u_low, u_high, v_low, v_high = _extent(edges, n_edges, np.bool_(False), bent_lens)
         if mesh.around:
             u_low, u_high, v_low, v_high = -np.inf, np.inf, -np.inf, np.inf
-        bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, True, bent_lens)
+        bent_low_u, bent_high_u, bent_low_v, bent_high_v = _extent(edges, n_edges, np.bool_(True), bent_lens)
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
         background = poses.background[view]
         n_edges = _add_background(background, cos_b, sin_b, poses.level[view], camera, edges, n_edges)
@@ -140,7 +140,7 @@ def plan_rays(  # type: ignore[no-untyped-def]
     return len(poses.lens), n
 
 
-@kernel
+@inner
 def _distance(mesh, lens):  # type: ignore[no-untyped-def]
     """Return how far a landmark is, or the middle of a scene, and at least half of what that extends over."""
     if not mesh.around:
@@ -152,7 +152,7 @@ def _distance(mesh, lens):  # type: ignore[no-untyped-def]
     return math.sqrt(max(away, 0.25 * extent))
 
 
-@kernel
+@inner
 def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type: ignore[no-untyped-def]
     """Append the line where wall and floor meet, or the horizon; return the number of segments, −1 without room."""
     lens = camera.distortion
@@ -172,11 +172,11 @@ def _add_background(background, cos_b, sin_b, level, camera, edges, n):  # type:
         ya, yb = -(tx + tz * za) / ty, -(tx + tz * zb) / ty
     else:
         return n
-    nowhere = np.int32(-1)
-    return add_bent_edge(ya, za, yb, zb, nowhere, nowhere, np.int64(0), camera, edges, n)
+    nowhere, crease = np.int64(-1), np.int64(0)
+    return add_bent_edge(ya, za, yb, zb, nowhere, nowhere, crease, camera, edges, n)
 
 
-@kernel
+@inner
 def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
     """Return whether a limb runs through a pixel or one beside it: the rules beside a limb want square boxes."""
     head = edges.head
@@ -186,7 +186,7 @@ def _near_limb(i, j, edges):  # type: ignore[no-untyped-def]
     return False
 
 
-@kernel
+@inner
 def _extent(edges, n_edges, of_limbs, bent_lens):  # type: ignore[no-untyped-def]
     """Return the extent of the edges, or of the limbs among them: lower and upper u, lower and upper v.
 

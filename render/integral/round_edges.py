@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner
 
 RIM, SEAM, BALL, CAP, TUBE = 0, 1, 2, 3, 4
 """Edge of the plane face W · (p − C) = 0; that of a cap; outline of a ball; of its half W · (p − C) > 0; of a tube."""
@@ -24,7 +24,7 @@ _FEWEST, _MOST = 64, 512
 """Segments of a whole turn."""
 
 
-@kernel
+@inner
 def arc_of(curve, lens, arc):  # type: ignore[no-untyped-def]
     """Fill the ellipse of a curve, `arc` (3, 3): centre and two axes, world frame.
 
@@ -50,7 +50,7 @@ def arc_of(curve, lens, arc):  # type: ignore[no-untyped-def]
     return middle - half, middle + half
 
 
-@kernel
+@inner
 def is_slender(curve):  # type: ignore[no-untyped-def]
     """Return whether the axes of a ball differ by more than a tenth."""
     least, most = math.inf, 0.0
@@ -60,7 +60,7 @@ def is_slender(curve):  # type: ignore[no-untyped-def]
     return most > 1.2 * least
 
 
-@kernel
+@inner
 def before_rim(curve, lens):  # type: ignore[no-untyped-def]
     """Return whether the lens is before the plane that a rim is the edge of."""
     height = 0.0
@@ -69,7 +69,7 @@ def before_rim(curve, lens):  # type: ignore[no-untyped-def]
     return height > 0.0
 
 
-@kernel
+@inner
 def _outline_of_ball(curve, x, y, z, arc):  # type: ignore[no-untyped-def]
     """Fill the circle of a ball's outline as :func:`arc_of` does, with its first axis towards W as far as it can be."""
     square = x * x + y * y + z * z
@@ -97,7 +97,7 @@ def _outline_of_ball(curve, x, y, z, arc):  # type: ignore[no-untyped-def]
     return -half, half
 
 
-@kernel
+@inner
 def segments_of(span, size_px):  # type: ignore[no-untyped-def]
     """Return how many segments stand for an arc of `span` radians of a curve that is `size_px` in radius."""
     step = math.sqrt(8.0 * _SAGITTA / max(size_px, 1e-9))

@@ -33,7 +33,7 @@ from phasemark.render.integral.mesh_topology import MeshTopology
 from phasemark.render.integral.quadrature_rules import G2W, G2X, G4W, G4X, gauss_legendre
 from phasemark.render.integral.ray_plan import SKIPPED, plan_rays
 from phasemark.render.integral.surface_mesh import SurfaceMesh
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 from phasemark.render.rigid import rigid_transforms
 from phasemark.render.view import Views
 
@@ -271,7 +271,7 @@ def plane_samples(distance_m: ArrayLike, grid: Camera, tilt: tuple[float, float]
     )
 
 
-@kernel
+@inner
 def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[no-untyped-def]
     """Write a point of the ray (1, y, z) in line k of the columns of :class:`SceneSamples`; returns the next line."""
     length = math.sqrt(1.0 + y * y + z * z)
@@ -284,7 +284,7 @@ def _keep(columns, k, y, z, t, reflected, weight, area, part):  # type: ignore[n
     return k + 1
 
 
-@kernel
+@inner
 def _corners(samples, p, mesh, poses, camera, farthest_m, corners):  # type: ignore[no-untyped-def]
     """Fill the corners of a piece of a plane, one after the other around it: y, z, and g, what their ranges go with.
 
@@ -333,7 +333,7 @@ def _count_points(samples, mesh, poses, camera, scale, corners, counts):  # type
     return total
 
 
-@kernel
+@inner
 def _range_steps(samples, p, mesh, poses, camera, scale, corners):  # type: ignore[no-untyped-def]
     """Fill the corners of a piece; return 1/g of its farthest and nearest, and the step that two points resolve.
 
@@ -353,7 +353,7 @@ def _range_steps(samples, p, mesh, poses, camera, scale, corners):  # type: igno
     return 1.0 / least, 1.0 / most, finest_m / length / max(share, 1e-9) ** 0.25
 
 
-@kernel
+@inner
 def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, corners):  # type: ignore[no-untyped-def]
     """Write the points that resolve the ranges of a piece; returns the next line.
 
@@ -361,7 +361,8 @@ def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, cor
     resolve its ranges, and two points on each line what else changes.
     """
     first, stop = samples.pieces.samples[p]
-    face, whole = samples.face[first], 0.0
+    face, whole = np.int64(samples.face[first]), 0.0
+    body = np.int64(mesh.part[face])
     for k in range(first, stop):
         whole += samples.weights[k]
     far, near, step = _range_steps(samples, p, mesh, poses, camera, scale, corners)
@@ -386,7 +387,7 @@ def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, cor
                     if t > 0.0:
                         length = math.sqrt(1.0 + own_y * own_y + own_z * own_z)
                         reflected = reflected_by(mesh, face, 1.0, reflected, length)
-                        kept = _keep(columns, kept, own_y, own_z, t, reflected, G2W[k] * weight, area, mesh.part[face])
+                        kept = _keep(columns, kept, own_y, own_z, t, reflected, G2W[k] * weight, area, body)
         far = nearer
     _, _, amplitude, areas, _ = columns
     for k in range(start, kept):
@@ -395,7 +396,7 @@ def _keep_piece(columns, kept, p, samples, mesh, poses, camera, area, scale, cor
     return kept
 
 
-@kernel
+@inner
 def _chord(corners, g):  # type: ignore[no-untyped-def]
     """Return both ends, y and z each, of the line across a piece along which g has one value."""
     y, z, y_far, z_far, found = 0.0, 0.0, 0.0, 0.0, False
@@ -413,7 +414,7 @@ def _chord(corners, g):  # type: ignore[no-untyped-def]
 @kernel
 def _hits(n, samples, counts, mesh, poses, camera, background, n_parts, scale, corners, columns):  # type: ignore[no-untyped-def]
     """Fill path length and amplitude of the samples that meet something; returns how many there are."""
-    kept, k, p = 0, 0, 0
+    kept, k, p = np.int64(0), np.int64(0), np.int64(0)
     area = 1.0 / (camera.scale_u * camera.scale_v)
     behind = background[0] > 0.0 or background[1] > 0.0
     cos_b, sin_b = math.cos(poses.bearing[0]), math.sin(poses.bearing[0])
@@ -426,11 +427,11 @@ def _hits(n, samples, counts, mesh, poses, camera, background, n_parts, scale, c
                 continue
         face = samples.face[k]
         y, z = samples.rays[k, 0], samples.rays[k, 1]
-        t, reflected, seen = 0.0, 0.0, 0
+        t, reflected, seen = 0.0, 0.0, np.int64(0)
         if face >= 0:
             t, reflected = landmark_hit(mesh, face, poses.lens[0], poses.matrix[0], y, z)
             reflected = reflected_by(mesh, face, 1.0, reflected, math.sqrt(1.0 + y * y + z * z))
-            seen = mesh.part[face]
+            seen = np.int64(mesh.part[face])
         elif behind:
             dx, dy, dz = towards_level(poses.level[0], y, z)
             t, rho, facing = background_hit(background, cos_b, sin_b, dx, dy, dz)
@@ -442,7 +443,7 @@ def _hits(n, samples, counts, mesh, poses, camera, background, n_parts, scale, c
     return kept
 
 
-@kernel
+@inner
 def _clipped_range(u, v, cos_b, sin_b, level, camera, background, farthest_m):  # type: ignore[no-untyped-def]
     """Return the range of what stands behind a point of the grid, `farthest_m` where nothing nearer does."""
     y, z = ray_of(camera, u, v)
@@ -451,7 +452,7 @@ def _clipped_range(u, v, cos_b, sin_b, level, camera, background, farthest_m):  
     return min(t * math.sqrt(1.0 + y * y + z * z), farthest_m) if t > 0.0 else farthest_m
 
 
-@kernel
+@inner
 def _boxes(c, r, cos_b, sin_b, level, camera, background, scale):  # type: ignore[no-untyped-def]
     """Return into how many boxes along u and v a cell is cut so that its points resolve the background's ranges."""
     finest_m, farthest_m = scale

@@ -10,7 +10,7 @@ import numpy as np
 
 from phasemark.render.integral.edges_in_pixels import MAX_SEGMENTS, edge_at
 from phasemark.render.integral.intervals import EMPTY, Strip, sample_strip
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import inlined, inner
 
 MAX_EVENTS = 4 * MAX_SEGMENTS + 64
 MAX_SLABS = 256
@@ -23,7 +23,7 @@ PINCH = 1e-6
 """Edges closer than this (pixels) at the end of a slab meet there."""
 
 
-@kernel
+@inner
 def find_events(box, m, scratch):  # type: ignore[no-untyped-def]
     """Collect, sorted, where the order of the edges across the sweep may change.
 
@@ -66,7 +66,7 @@ def find_events(box, m, scratch):  # type: ignore[no-untyped-def]
     return n
 
 
-@kernel
+@inner
 def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped-def]
     """Update the list of edges that span the slab [lo, hi], ordered along its middle line.
 
@@ -96,7 +96,7 @@ def _activate(lo, hi, m, started, n_active, scratch):  # type: ignore[no-untyped
     return started, n_active
 
 
-@kernel
+@inner
 def _continues(m, last, n, stop, lo, scratch):  # type: ignore[no-untyped-def]
     """Return True if the edges of two neighbouring slabs are the same, or links of the same smooth curves.
 

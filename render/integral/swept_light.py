@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from phasemark.render.background import hit_of_plane, nearer_plane
 from phasemark.render.integral.arguments import towards_landmark, towards_level
 from phasemark.render.integral.face_search import find_face
 from phasemark.render.integral.image_rays import ray_of
 from phasemark.render.integral.light import landmark_hit, phasor_of
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 
 @kernel
@@ -39,13 +41,16 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             count = region + 1
     first_of[count] = n
     pixels_per_view = (camera.stop_row - camera.first_row) * camera.cols
+    on_left, on_right = np.int64(0), np.int64(1)
     same_depth = 1e-4  # relative difference of two depths up to which they are one
     for b in range(borders.placed[0]):
         index = borders.pixel[b]
         view = index // pixels_per_view
         y, z = ray_of(camera, borders.points[b, 0], borders.points[b, 1])
-        depth_left, left = _light_beside(b, 0, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
-        depth_right, right = _light_beside(b, 1, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        depth_left, left = _light_beside(b, on_left, y, z, view, samples, first_of, mesh, poses, camera, light, borders)
+        depth_right, right = _light_beside(
+            b, on_right, y, z, view, samples, first_of, mesh, poses, camera, light, borders
+        )
         limit, side = borders.depth[b] * (1.0 - same_depth), borders.side[b]
         if side > 0.0:  # at a limb cos θ of its own surface is 0, and so is its light; hidden, it changes nothing
             jump = left if depth_left > limit else 0j
@@ -57,7 +62,7 @@ def sum_borders(n, samples, first_of, mesh, poses, camera, light, borders, slope
             slope[index, k] += borders.weights[b] * borders.rates[b, k] * jump
 
 
-@kernel
+@inner
 def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, light, borders):  # type: ignore[no-untyped-def]
     """Return depth and light of what is seen on one side of an edge; depth is infinite where there is nothing."""
     points, region = samples.points, borders.regions[b, which]
@@ -66,7 +71,7 @@ def _light_beside(b, which, y, z, view, samples, first_of, mesh, poses, camera, 
         du, dv = points[k, 0] - borders.points[b, 0], points[k, 1] - borders.points[b, 1]
         if du * du + dv * dv < least:
             nearest, least = k, du * du + dv * dv
-    face = samples.face[nearest]
+    face = np.int64(samples.face[nearest])
     length = math.sqrt(1.0 + y * y + z * z)
     lens, matrix = poses.lens[view], poses.matrix[view]
     if face >= 0:

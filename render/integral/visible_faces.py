@@ -12,7 +12,7 @@ import numpy as np
 from phasemark.render.integral.arguments import towards_landmark
 from phasemark.render.integral.face_search import find_face, look_about, plane_hit, turns_smoothly
 from phasemark.render.integral.ray_plan import SPLIT
-from phasemark.render.kernel import inlined, kernel
+from phasemark.render.kernel import inlined, inner, kernel
 
 
 @kernel
@@ -22,7 +22,7 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
     Samples of an interval all see one smooth patch of the surface: one tells which.
     """
     regions, chosen = samples.regions, samples.chosen
-    count, start = 0, 0
+    count, start = 0, np.int64(0)
     for k in range(1, n + 1):
         if k == n or regions[k] != regions[start]:
             chosen[count] = _scout(start, k, samples.weights)
@@ -31,7 +31,7 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
     return count
 
 
-@kernel
+@inner
 def _scout(start, stop, weights):  # type: ignore[no-untyped-def]
     """Return the sample with the largest weight, the middle one if it is among those.
 
@@ -56,7 +56,7 @@ def share_faces(n, mesh, scout_face, samples, poses, camera, state):  # type: ig
     Returns how many indices were written to ``samples.chosen``.
     """
     regions, pixel, face, chosen = samples.regions, samples.pixel, samples.face, samples.chosen
-    count, start, region = np.int64(0), 0, 0
+    count, start, region = np.int64(0), np.int64(0), 0
     states = state.reshape(-1)
     for k in range(1, n + 1):
         if k < n and regions[k] == regions[start]:
@@ -68,7 +68,7 @@ def share_faces(n, mesh, scout_face, samples, poses, camera, state):  # type: ig
             for i in range(start, k):
                 face[i] = found
         elif known and mesh.searched[found]:
-            count = _search(np.int64(start), k, scout, count, mesh, samples, poses, camera)
+            count = _search(start, k, scout, count, mesh, samples, poses, camera)
         else:
             for i in range(start, k):
                 if i != scout:

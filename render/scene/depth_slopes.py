@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from phasemark.render.kernel import kernel
+from phasemark.render.kernel import inner, kernel
 
 
 @kernel
@@ -51,7 +51,7 @@ def fill_amplitudes(inverse_m, x, y, step, out):  # type: ignore[no-untyped-def]
             out[i, j] = w * w * w / (length2 * math.sqrt(normal2 * length2))
 
 
-@kernel
+@inner
 def _slope(a, b, c, d, e, width):  # type: ignore[no-untyped-def]
     """Return by how much c changes to the next of five values, from those on its own side of a step.
 
@@ -79,7 +79,7 @@ def _slope(a, b, c, d, e, width):  # type: ignore[no-untyped-def]
     return slope
 
 
-@kernel
+@inner
 def _one_sided(near, far):  # type: ignore[no-untyped-def]
     """Return the slope at the first of three values, from the differences to the second and of that to the third.
 
