@@ -13,8 +13,8 @@ import time
 from numba.core import event
 
 _AFTER_S = 1.0
-_ABOUT_S = {"rendering": 25, "matching": 20}
-"""Processor time that compiling takes altogether, on two cores of a server of 2020."""
+_ABOUT_S = {"rendering": 60, "matching": 30}
+"""Processor time that compiling takes altogether on a core of a server, from a third less to a third more."""
 _SWITCH = "PHASEMARK_COMPILE_NOTES"
 """Environment variable that is 0 where no line is wanted."""
 _OTHER = "the work of others"

@@ -19,11 +19,12 @@ from numba.core.cpu import CPUTargetOptions
 _BORROWING: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "forceinline": True}
 if hasattr(CPUTargetOptions, "_nrt"):
     _BORROWING["_nrt"] = False
+_NO_WAY_IN: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
 
 kernel = njit(**_BORROWING)
 """Compile a function that allocates nothing; floats divide as numpy's do."""
 
-inner = njit(**_BORROWING, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+inner = njit(**_BORROWING, **_NO_WAY_IN)
 """Compile a function that compiled ones call and Python never does, which would end the process.
 
 A way in from Python takes a quarter of the time to compile, most of it for tuples of arrays.

@@ -27,7 +27,7 @@ def pick_scouts(n, samples):  # type: ignore[no-untyped-def]
         if k == n or regions[k] != regions[start]:
             chosen[count] = _scout(start, k, samples.weights)
             count += 1
-            start = k
+            start = np.int64(k)
     return count
 
 
@@ -74,7 +74,7 @@ def share_faces(n, mesh, scout_face, samples, poses, camera, state):  # type: ig
                 if i != scout:
                     chosen[count] = i
                     count += 1
-        start = k
+        start = np.int64(k)
         region += 1
     return count
 
