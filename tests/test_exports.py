@@ -235,7 +235,8 @@ def test_bop_models_load_as_the_toolkit_loads_them(bop):
             np.testing.assert_allclose(np.reshape(turn, (4, 4))[3], [0, 0, 0, 1])
 
 
-def test_a_bag_whose_images_are_millimetres_and_metres_is_refused(tmp_path):
+def write_bag(folder, images):
+    """Write a bag of images: topic, stamp in nanoseconds and values, float32 metres or uint16 mm."""
     rosbags = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
 
@@ -243,17 +244,60 @@ def test_a_bag_whose_images_are_millimetres_and_metres_is_refused(tmp_path):
     image, header, stamp = (
         store.types[name] for name in ("sensor_msgs/msg/Image", "std_msgs/msg/Header", "builtin_interfaces/msg/Time")
     )
-    with rosbags.Writer(tmp_path / "both", version=9) as writer:
-        link = writer.add_connection("/tof/depth", "sensor_msgs/msg/Image", typestore=store)
-        for k, (encoding, kind, value) in enumerate((("16UC1", "<u2", 700), ("32FC1", "<f4", 0.7))):
-            data = np.full((8, 8), value, kind)
+    links = {}
+    with rosbags.Writer(folder, version=9) as writer:
+        for k, (topic, time_ns, data) in enumerate(images):
+            if topic not in links:
+                links[topic] = writer.add_connection(topic, "sensor_msgs/msg/Image", typestore=store)
+            at = stamp(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
             message = image(
-                header=header(stamp=stamp(sec=k, nanosec=0), frame_id="camera"), height=8, width=8, encoding=encoding,
-                is_bigendian=0, step=data.strides[0], data=data.view(np.uint8).ravel(),
+                header=header(stamp=at, frame_id="camera"), height=len(data), width=data.shape[1],
+                encoding="16UC1" if data.dtype == np.uint16 else "32FC1", is_bigendian=0, step=data.strides[0],
+                data=data.view(np.uint8).ravel(),
             )  # fmt: skip
-            writer.write(link, k * 10**9, store.serialize_cdr(message, "sensor_msgs/msg/Image"))
+            writer.write(links[topic], k * 10**6, store.serialize_cdr(message, "sensor_msgs/msg/Image"))
+    return folder
+
+
+def test_a_bag_whose_images_are_millimetres_and_metres_is_refused(tmp_path):
+    both = [
+        ("/tof/depth", k * 10**9, np.full((8, 8), value)) for k, value in enumerate((np.uint16(700), np.float32(0.7)))
+    ]
     with pytest.raises(InputFileError, match="'/tof/depth' must hold images of one encoding, 16UC1"):
-        read_frames(tmp_path / "both", sensor=preset("vl53l5cx-8x8"), quantity="z")
+        read_frames(write_bag(tmp_path / "both", both), sensor=preset("vl53l5cx-8x8"), quantity="z")
+
+
+def test_stamps_of_a_bag_are_read_and_amplitudes_belong_to_the_image_of_their_stamp(tmp_path):
+    """The recording began between an image and its amplitudes, and ended so."""
+    depth, amplitude = "/camera/depth/image_rect", "/camera/amplitude/image"
+
+    def images(topic, numbers, stamped=True):
+        first_ns = 1_790_000_000 * 10**9
+        return [
+            (
+                topic,
+                (first_ns + k * 10**8) * stamped,
+                np.full((16, 16), 100 * (topic == amplitude) + 1 + k / 10, np.float32),
+            )
+            for k in numbers
+        ]
+
+    shifted = read_frames(
+        write_bag(tmp_path / "shifted", images(amplitude, range(5)) + images(depth, range(1, 4))), sensor=SENSOR
+    )
+    np.testing.assert_allclose(shifted.amplitude_e[0, :, 0, 0], [101.1, 101.2, 101.3], rtol=1e-6)
+    np.testing.assert_allclose(np.diff(shifted.time_s[0]), 0.1, atol=1e-6)
+    assert shifted.time_s[0, 0] == pytest.approx(1_790_000_000.1, abs=1e-6)
+    unset = write_bag(tmp_path / "unset", images(depth, range(3), False) + images(amplitude, range(3), False))
+    without = read_frames(unset, sensor=SENSOR)
+    assert without.time_s is None
+    np.testing.assert_allclose(without.amplitude_e[0, :, 0, 0], [101, 101.1, 101.2], rtol=1e-6)
+    late = write_bag(tmp_path / "late", images(depth, range(4)) + images(amplitude, range(1, 4)))
+    with pytest.warns(UserWarning, match="3 amplitudes of 4 images, not all of the same stamps: left out"):
+        assert read_frames(late, sensor=SENSOR).amplitude_e is None
+    twice = write_bag(tmp_path / "twice", images(depth, (0, 0, 1)))
+    with pytest.warns(UserWarning, match="1 of 3 time stamps repeat, the first in image 1"):
+        read_frames(twice, sensor=SENSOR)
 
 
 def test_the_bag_is_a_ros_2_bag_with_labelled_quantities(frames, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError, PhasemarkError
-from phasemark.data.measured.recording import Recording
+from phasemark.data.measured.recording import Recording, note_disorder
 from phasemark.inputs import is_vouched_for
 from phasemark.inputs.extras import needed
 
@@ -32,7 +33,9 @@ def ros_types() -> Any:
 
 
 def read_rosbag(path: Path, topic: str | None) -> Recording:
-    """Return the images of a bag, (frames, rows, cols), and what the bag says of unit and quantity.
+    """Return the images of a bag, (frames, rows, cols), their stamps, and what the bag says of unit and quantity.
+
+    Amplitudes belong to the ranges of their stamp, or to those of their number where there are as many.
 
     Parameters
     ----------
@@ -45,6 +48,11 @@ def read_rosbag(path: Path, topic: str | None) -> Recording:
     ------
     InputFileError
         It is no bag, or has no depth images.
+
+    Warns
+    -----
+    UserWarning
+        Time stamps repeat or run backwards, or there are amplitudes of some ranges alone, which are left out.
     """
     store = ros_types()
     try:
@@ -61,7 +69,7 @@ def read_rosbag(path: Path, topic: str | None) -> Recording:
 def _read(path: Path, topic: str | None, store: Any) -> Recording:
     from rosbags.rosbag2 import Reader
 
-    found: dict[str, list[NDArray[Any]]] = {}
+    found: dict[str, list[tuple[float, NDArray[Any]]]] = {}
     units = set()
     with Reader(path) as reader:
         of_images = [link for link in reader.connections if link.msgtype == "sensor_msgs/msg/Image"]
@@ -74,22 +82,35 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
         wanted = [link for link in of_images if link.topic in (chosen, AMPLITUDE_TOPIC)]
         for link, _, raw in reader.messages(connections=wanted):
             message = store.deserialize_cdr(raw, link.msgtype)
-            found.setdefault(link.topic, []).append(_pixels(message, path))
+            stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+            found.setdefault(link.topic, []).append((stamp_s, _pixels(message, path)))
             if link.topic == chosen:
                 units.add("mm" if message.encoding == "16UC1" else "m")
-    images, amplitudes = found.get(chosen, []), found.get(AMPLITUDE_TOPIC, [])
+    images, stamped = [image for _, image in found.get(chosen, [])], found.get(AMPLITUDE_TOPIC, [])
     if not images or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: '{chosen}' must hold images of one size")
     if len(units) > 1:
         raise InputFileError(f"{path}: '{chosen}' must hold images of one encoding, 16UC1 (mm) or 32FC1 (m), not both")
-    values = np.stack(images)
+    values, stamps = np.stack(images), [stamp_s for stamp_s, _ in found[chosen]]
     arrays = {"range": np.where(values == 0, np.nan, values)}
-    if len(amplitudes) == len(images):
-        arrays["amplitude"] = np.stack(amplitudes)
+    by_stamp = dict(stamped)
+    if len(set(stamps)) == len(stamps) and by_stamp.keys() >= set(stamps):
+        arrays["amplitude"] = np.stack([by_stamp[stamp_s] for stamp_s in stamps])
+    elif len(stamped) == len(images):
+        arrays["amplitude"] = np.stack([image for _, image in stamped])
+    elif stamped:
+        warnings.warn(
+            f"{path}: {len(stamped)} amplitudes of {len(images)} images, not all of the same stamps: left out",
+            stacklevel=2,
+        )
     stated = {"unit": units.pop()}
     if chosen in (RANGE_TOPIC, Z_TOPIC):
         stated["quantity"] = "range" if chosen == RANGE_TOPIC else "z"
-    return Recording(arrays, stated)
+    if not any(stamps):  # nobody set them
+        return Recording(arrays, stated)
+    time_s = np.array(stamps)
+    note_disorder(time_s, path, "image {}".format)
+    return Recording(arrays, stated, time_s=time_s)
 
 
 def _pixels(message: Any, path: Path) -> NDArray[Any]:
