@@ -360,7 +360,7 @@ def _tried(problem: Problem, edges: bool | None) -> _Tried:
         if problem.moving:
             problem = problem.changed(lambda one: one.by_time(frames_tried // len(problem.recordings))[0])
         fit = RecordingFit(problem, edges=edges)
-        found = fit.approach()
+        found = fit.approach(central=False)
     except UsageError:
         return _Tried(math.inf, 0, math.nan, math.nan)
     assumed, most = fit.assumed[fit.columns], TRUSTED * fit.prior * fit.scale

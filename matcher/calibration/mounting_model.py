@@ -316,8 +316,9 @@ class CalibrationModel:
         *,
         shift: _Float | None = None,
         width: _Float | None = None,
+        central: bool = True,
     ) -> NDArray[np.complex128]:
-        """Return how the images change, by central differences.
+        """Return how the images change, by differences.
 
         On ranges the difference is one of phases, not of phasors: a pixel that an edge is just leaving has hardly any
         light at one end, and its range is as smooth as any other.
@@ -331,6 +332,8 @@ class CalibrationModel:
         on : {"ranges", "phasors"}
         width : (22,) float64, optional
             Half width of each difference; at least :attr:`step`.
+        central : bool
+            Whether differences are central: exact to the second order, and with twice as many images.
 
         Returns
         -------
@@ -342,17 +345,24 @@ class CalibrationModel:
         own = {name: _ALIKE[name] if _ALIKE.get(name) in names else name for name in POSE}
         moving = VIEW_FIELDS if self.poses.are_tilted else POSE
 
+        here = None if central else self.images(theta, shift).phasor
+
         def difference(name: str) -> NDArray[np.complex128]:
             if name in VIEW_FIELDS:
-                step, span = STEP * np.eye(len(VIEW_FIELDS))[VIEW_FIELDS.index(name)], 2 * STEP
+                step = STEP * np.eye(len(VIEW_FIELDS))[VIEW_FIELDS.index(name)]
                 base = np.zeros((len(self.poses), len(VIEW_FIELDS)))
                 if shift is not None:
                     base[:, : shift.shape[1]] = shift
-                high, low = self.images(theta, base + step).phasor, self.images(theta, base - step).phasor
+                high, span = self.images(theta, base + step).phasor, STEP if here is not None else 2 * STEP
+                low = self.images(theta, base - step).phasor if here is None else here
             else:
                 column = ALL_NAMES.index(name)
                 there, back, span = self.beside(theta, column, half[column])
-                high, low = self.images(there, shift).phasor, self.images(back, shift).phasor
+                high = self.images(there, shift).phasor
+                if here is not None and there[column] != theta[column]:
+                    low, span = here, float(there[column] - theta[column])
+                else:
+                    low = self.images(back, shift).phasor
             if on == "phasors":
                 return np.asarray((high - low) / span)
             return np.asarray(1j * np.angle(high * low.conj()) / span)
