@@ -170,13 +170,16 @@ def read_taps(means, start, stop, n_frames, first_view, first_frame, first_phase
             light, arrived = np.empty((4, 2, len(lit))), np.empty((2, len(lit)))
             for phase in range(4):
                 for tap in range(2):
-                    light[phase, tap] = mean[phase, tap][lit]
+                    for k in range(len(lit)):
+                        light[phase, tap, k] = mean[phase, tap, lit[k]]
             lit_words, lit_chosen, lit_uniform, lit_normal = _scratch(len(lit))
         over = saturated[i - start]
         over[:] = False
         for phase in range(4):
             row = taps[i - start, phase]
-            row[:] = mean[phase]
+            for tap in range(2):  # number by number: numba compiles an array that is set to another at length
+                for k in range(n):
+                    row[tap, k] = mean[phase, tap, k]
             if out.shot_noise:
                 samples = (first_phase + phase) * n + lit
                 fill_uniform(samples, frame, view, _SHOT, key, lit_words, lit_uniform)

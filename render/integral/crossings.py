@@ -177,10 +177,12 @@ def _cross(vertices, faces, others, blocks, other_blocks, touch, once, ends, pai
             )
             for i in range(n):
                 for k in range(3):
-                    a[k] = vertices[faces[own[i], k]]
+                    for axis in range(3):
+                        a[k, axis] = vertices[faces[own[i], k], axis]
                 for j in range(m):
                     for k in range(3):
-                        b[k] = vertices[others[other[j], k]]
+                        for axis in range(3):
+                            b[k, axis] = vertices[others[other[j], k], axis]
                     apart = False
                     for k in range(3):
                         apart = apart or max(a[0, k], a[1, k], a[2, k]) < min(b[0, k], b[1, k], b[2, k])

@@ -177,8 +177,9 @@ def _build_tree(low, high):  # type: ignore[no-untyped-def]
             children[node, 0], children[node, 1] = -1 - start, stop - start
             continue
         axis = np.argmax(centre_high - centre_low)
-        part = order[start:stop]
-        order[start:stop] = part[np.argsort(centre[part, axis])]
+        part = order[start:stop].copy()
+        for k, i in enumerate(np.argsort(centre[part, axis])):
+            order[start + k] = part[i]
         middle = (start + stop) // 2
         children[node, 0], children[node, 1] = used, used + 1
         stack[depth, 0], stack[depth, 1], stack[depth, 2] = used, start, middle
