@@ -27,7 +27,7 @@ kernel = njit(**_BORROWING)
 inner = njit(**_BORROWING, **_NO_WAY_IN)
 """Compile a function that compiled ones call and Python never does, which would end the process.
 
-A way in from Python takes a quarter of the time to compile, most of it for tuples of arrays.
+A way in from Python takes about a fifth of the time to compile, most of it for tuples of arrays.
 """
 
 inlined = njit(**_BORROWING, inline="always")
