@@ -526,6 +526,11 @@ def test_the_command_replays_a_recording(bank, printed, tmp_path, capsys):
     rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert len(rows) == 10
     assert rows[-1]["accepted"]
+    # a disk that is full is told in a line and by the exit code; other sinks get every frame
+    assert main([*words, "--to", "jsonl:/dev/full", "--force", "--to", "-"]) == 5
+    told = capsys.readouterr()
+    assert len(told.out.splitlines()) == 10
+    assert "jsonl:/dev/full: No space left on device; what was to be written there is not whole" in told.err
     assert main([*words, "--delay-ms", "nan"]) == 2
     assert "--delay-ms must be from -10000 to 10000, got nan" in capsys.readouterr().err
     assert main(["live", str(path), "--landmark", "cone"]) == 2

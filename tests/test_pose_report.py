@@ -149,6 +149,10 @@ def test_files_that_do_not_belong_together(run, files, tmp_path):
     track.write_text("\n".join(["t_s,distance_m,delta_deg", *(f"{100 + 0.1 * k},1.0,10.0" for k in range(40)), ""]))
     code, _, err = run("pose", "report", files[0], track)
     assert (code, "do the clocks agree?" in err) == (2, True)
+    twice = tmp_path / "twice.csv"
+    twice.write_text(files[0].read_text() + files[0].read_text().splitlines()[4] + "\n")
+    code, _, err = run("pose", "report", twice, files[1])
+    assert (code, "position 3 has more than one estimate: give each once" in err) == (2, True)
 
 
 @pytest.mark.parametrize(

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
 from operator import methodcaller
 
+from phasemark import StorageError
 from phasemark.matcher.live.sinks import Sink
 from phasemark.matcher.live.sources import Arrival, Source, SourceFault
 from phasemark.matcher.live.status import Status
 from phasemark.matcher.live.tracker import Locator
 from phasemark.matcher.live.updates import Update
 
+_DISK_FAILED = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO}
 _RETRY_S = 0.2
 """Pause before a source is opened again."""
 _SETTLES = 5
@@ -78,6 +81,8 @@ class Live:
         ------
         UsageError
             It is not known what the source's numbers mean.
+        StorageError
+            A disk was full or failed, and what a sink had to write is not whole. The session goes on all the same.
         """
         reader = threading.Thread(target=self._read, daemon=True)
         reader.start()
@@ -99,8 +104,7 @@ class Live:
             self._stop.set()
             self.source.stop()
             self._report()
-            for sink in self.sinks:
-                sink.close()
+            self._for_sinks(methodcaller("close"))
             self.locator.close()
             reader.join(1.0)
         if self._error:
@@ -174,12 +178,17 @@ class Live:
         self._for_sinks(lambda sink: sink.status(self.status))
 
     def _for_sinks(self, act: Callable[[Sink], None]) -> None:
-        """Let each sink act; one that fails is said in a line, and used again with the next frame."""
+        """Let each sink act; one that fails is said in a line, and used again with the next frame.
+
+        The first failure of a disk is an error when the session is over.
+        """
         for sink in self.sinks:
             try:
                 act(sink)
             except OSError as error:
                 line = f"{sink.name}: {error.strerror or error}"
+                if error.errno in _DISK_FAILED and not self._error:
+                    self._error.append(StorageError(f"{line}; what was to be written there is not whole"))
                 if isinstance(error, BrokenPipeError) and sink.name == "-":  # nobody reads standard output any more
                     self._error.append(error)
                     self._stop.set()
