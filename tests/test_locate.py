@@ -334,8 +334,10 @@ def test_a_recording_is_read_as_it_was_written_and_its_faults_are_named(tmp_path
         read_rig_recording(file, rig)
 
 
-def test_a_map_that_is_ten_thousand_kilometres_long_takes_no_memory():
-    grid = Locator(WallMap(walls_m=[[0, 0, 1e7, 0]]), ring_rig(2))._grid
+def test_a_map_in_millimetres_is_refused_and_one_of_two_kilometres_takes_no_memory():
+    with pytest.raises(UsageError, match=r"the map is 4000 m long, .* 4 m: are both in metres\?"):
+        Locator(WallMap(walls_m=[[0, 0, 4000, 0], [4000, 0, 4000, 3000]]), ring_rig(2))
+    grid = Locator(WallMap(walls_m=[[0, 0, 2000, 0], [2000, 0, 2000, 2000]]), ring_rig(2))._grid
     assert grid.range_m.nbytes < 1e9
 
 

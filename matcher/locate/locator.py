@@ -36,6 +36,9 @@ _HOPELESS = 4 * DISAGREEMENT
 _MOST_OUTLIERS = 2.0
 """Outliers of a pose that no prior speaks for, in those of the rig's noise: another room explains four columns of five.
 """
+_LONGEST_MAP = 500.0
+"""Length of a map over the reach of the sensors beyond which one of them has another unit: a room of 3 m in millimetres
+has 750 and more."""
 _LEAST_STD = 1e-6
 """Smallest standard deviation of a start, m and rad."""
 _SPEAKS_FOR, _CONTRADICTS = special.chdtri(3, [1e-2, 1e-4]).tolist()
@@ -154,7 +157,8 @@ class Locator:
     Raises
     ------
     UsageError
-        A tolerance that is not positive, a share outside (0, 1), sensors that see different faces of the map.
+        A tolerance that is not positive, a share outside (0, 1), sensors that see different faces of the map, or a map
+        500 times as long as the sensors see, as one in millimetres is.
 
     Examples
     --------
@@ -181,6 +185,12 @@ class Locator:
         self.tolerance_m, self.tolerance_rad, self.least_explained = tolerance_m, tolerance_rad, least_explained
         self.wall_map, self.rig = wall_map, rig
         self.model = StopModel(rig, rig.outline_of(wall_map, in_space=with_tilt), rig.numbers())
+        low_x, low_y, high_x, high_y = self.model.outline.bounds_m
+        longest, reach = max(high_x - low_x, high_y - low_y), rig.noise.max_range_m
+        if longest > _LONGEST_MAP * reach:
+            raise UsageError(
+                f"the map is {longest:.4g} m long, and 'noise.max_range_m' of the rig {reach:g} m: are both in metres?"
+            )
         self._grid = pose_grid(self.model.outline, rig.noise.max_range_m)
         self.with_tilt = with_tilt
         self._in_space: dict[int, SpaceModel] = {}
