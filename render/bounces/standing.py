@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from threading import Lock
 from typing import Any, NamedTuple
 from weakref import WeakValueDictionary
@@ -25,7 +25,7 @@ from phasemark.render.background import BOUNCES
 from phasemark.render.bounces.bounced_light import pixels_of, summed
 from phasemark.render.bounces.patches import Patches, SizeAt, make_patches
 from phasemark.render.bounces.sheets import Sheets
-from phasemark.render.bounces.transport import transport_between
+from phasemark.render.bounces.transport import Operator, transport_between
 from phasemark.render.integral.area_integral import camera_of, of_poses, topology_of
 from phasemark.render.integral.arguments import Poses
 from phasemark.render.integral.intersect import make_intersector
@@ -234,7 +234,9 @@ class StandingLight:
         weights = [_cubic(p - f - 1) for p, f in zip(place, first, strict=True)]
         around = round(2 * math.pi / _STEP_RAD)
         shares = _lagrange(_ALBEDOS, view.floor_albedo)
-        found, at_sheets = None, None
+        views: dict[tuple[object, ...], StandingView] = {}
+        nodes: dict[tuple[object, ...], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
+        weight_of = {}
         for a, weight_a in enumerate(weights[0]):
             distance_m = math.exp(_STEP_SHARE * (first[0] + a))
             for b, weight_b in enumerate(weights[1]):
@@ -246,17 +248,24 @@ class StandingLight:
                     key, bounces, first[0] + a, turn, axis,
                     view.wall_m, view.floor_m, round(view.lens[2] / _SNAP_M), view.wall_albedo,
                 )  # fmt: skip
+                weight_of[name] = weight * shares
                 with self._lock:
                     node = self._nodes.get(name)
                 if node is None:
-                    node = self._solved(stand, self._node_view(view, distance_m, turn * _STEP_RAD, axis), bounces)
-                    with self._lock:
-                        self._nodes[name] = node
-                        if len(self._nodes) > _MOST_NODES:
-                            del self._nodes[next(iter(self._nodes))]
-                own = [values @ (weight * shares) for values in node]
-                found = own[0] if found is None else found + own[0]
-                at_sheets = own[1] if at_sheets is None else at_sheets + own[1]
+                    views[name] = self._node_view(view, distance_m, turn * _STEP_RAD, axis)
+                else:
+                    nodes[name] = node
+        solved = dict(zip(views, self._solved(stand, list(views.values()), bounces), strict=True))
+        with self._lock:
+            self._nodes.update(solved)
+            while len(self._nodes) > _MOST_NODES:
+                del self._nodes[next(iter(self._nodes))]
+        nodes |= solved
+        found, at_sheets = None, None
+        for name, weight in weight_of.items():
+            own = [values @ weight for values in nodes[name]]
+            found = own[0] if found is None else found + own[0]
+            at_sheets = own[1] if at_sheets is None else at_sheets + own[1]
         assert found is not None
         assert at_sheets is not None
         scale = self._scale(view.distance_m)
@@ -386,15 +395,33 @@ class StandingLight:
         return light, distance
 
     def _solved(
-        self, stand: Stand, view: StandingView, bounces: float
-    ) -> tuple[NDArray[np.complex64], NDArray[np.complex64]]:
-        """Return the light that arrives at patches and sheets at a node, without :meth:`_scale`.
+        self, stand: Stand, views: Sequence[StandingView], bounces: float
+    ) -> list[tuple[NDArray[np.complex64], NDArray[np.complex64]]]:
+        """Return the light that arrives at patches and sheets at each of some nodes, without :meth:`_scale`.
 
-        (frequencies, n, albedos of the floor) and (frequencies, w, albedos).
+        (frequencies, n, albedos of the floor) and (frequencies, w, albedos). What patches send each other at all nodes
+        is one product with a sparse matrix, which is read once.
         """
+        lit = [self._lit(stand, view) for view in views]
+        found: list[list[tuple[NDArray[Any], NDArray[Any]]]] = [[] for _ in views]
+        for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
+            for own, light in zip(
+                found,
+                _together(operator, [_bounced(stand, one, wave_number, bounces) for one in lit]),
+                strict=True,
+            ):
+                own.append(light)
+        solved = []
+        for view, own in zip(views, found, strict=True):
+            scale = 1 / self._scale(view.distance_m)[:, :, None]
+            at_patches, at_sheets = (np.array(each) * scale for each in zip(*own, strict=True))
+            solved.append((at_patches.astype(np.complex64), at_sheets.astype(np.complex64)))
+        return solved
+
+    def _lit(self, stand: Stand, view: StandingView) -> _Lit:
+        """Return what the lamp lights at a node, and what shares of the light return."""
         patches, sheets = stand.patches, self._sheets(view)
-        n = len(patches)
-        whole = np.ones(n)
+        whole = np.ones(len(patches))
         if sheets is not None:  # the floor of patches ends at the strip
             ahead = np.array([math.cos(view.delta_rad), math.sin(view.delta_rad), 0.0])
             beyond = (patches.centre - view.lens) @ ahead - (view.wall_m - sheets.depth_m)
@@ -403,34 +430,8 @@ class StandingLight:
         returned = whole[:, None] * np.where(own[:, None], (self._albedo * patches.albedo)[:, None], _ALBEDOS)
         points, normals, weights, owner = patches.points_before(view.lens, _NEAR_LENS)
         light, way = self._lamp(points, normals, view, patches)
-        light *= weights
         coupled = None if sheets is None else self._coupled(stand, sheets, view)
-        found, at_sheets = [], []
-        for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
-            lamp = summed(owner, light * np.exp(1j * wave_number * way), n)
-            term: NDArray[Any] = np.repeat(lamp[:, None], len(_ALBEDOS), axis=1)
-            of_sheets = np.zeros((0, len(_ALBEDOS)), np.complex128)
-            if coupled is not None:
-                to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
-            total, total_sheets = np.zeros_like(term), np.zeros_like(of_sheets)
-            size, before, last, done = 0.0, np.zeros(0), np.abs(term).sum(axis=0), 0
-            while done < bounces and last.max() > _SMALL * size:
-                sent = returned * term
-                term = operator @ sent.astype(np.complex64)
-                if coupled is not None:
-                    from_sheets = coupled.albedo * of_sheets
-                    term = term + (to_groups @ from_sheets)[stand.group]
-                    of_sheets = from_groups @ (stand.mean @ sent) + among @ from_sheets
-                total, total_sheets, done = total + term, total_sheets + of_sheets, done + 1
-                before, last = last, np.abs(term).sum(axis=0)
-                size = float(last.max()) if done == 1 else size
-            if done < bounces and (last < before).all():  # what is left falls off as a geometric series
-                rest = last / (before - last)
-                total, total_sheets = total + rest * term, total_sheets + rest * of_sheets
-            found.append(total)
-            at_sheets.append(total_sheets)
-        scale = 1 / self._scale(view.distance_m)[:, :, None]
-        return (np.array(found) * scale).astype(np.complex64), (np.array(at_sheets) * scale).astype(np.complex64)
+        return _Lit(returned, light * weights, way, owner, coupled)
 
     def _coupled(self, stand: Stand, sheets: Sheets, view: StandingView) -> _Coupled:
         """Return the exchange of light between sheets and groups and among sheets, and the lamp's light on them."""
@@ -460,6 +461,78 @@ class StandingLight:
             exchange, distance, among, apart, sheets.area, albedo,
             light.reshape(points.shape[:2]), way.reshape(points.shape[:2]),
         )  # fmt: skip
+
+
+class _Lit(NamedTuple):
+    """A node before light bounces.
+
+    Parameters
+    ----------
+    returned : (n, albedos) float64
+        Share of the light that each patch returns.
+    light, way : (m,) float64
+        Light of the lamp at points of patches, and their distance from it.
+    owner : (m,) int64
+        Their patches.
+    coupled : _Coupled, optional
+        Exchange with wall and strip.
+    """
+
+    returned: NDArray[np.float64]
+    light: NDArray[np.float64]
+    way: NDArray[np.float64]
+    owner: NDArray[np.int64]
+    coupled: _Coupled | None
+
+
+_Bounces = Generator[NDArray[Any], NDArray[Any], tuple[NDArray[Any], NDArray[Any]]]
+
+
+def _bounced(stand: Stand, lit: _Lit, wave_number: float, bounces: float) -> _Bounces:
+    """Yield the light that leaves the patches, bounce by bounce, for that which arrives; return the sum of the latter.
+
+    At patches, (n, albedos), and at sheets, (w, albedos).
+    """
+    returned, coupled = lit.returned, lit.coupled
+    lamp = summed(lit.owner, lit.light * np.exp(1j * wave_number * lit.way), len(returned))
+    term: NDArray[Any] = np.repeat(lamp[:, None], len(_ALBEDOS), axis=1)
+    of_sheets = np.zeros((0, len(_ALBEDOS)), np.complex128)
+    if coupled is not None:
+        to_groups, from_groups, among, of_sheets = coupled.operators(wave_number, stand.area)
+    total, total_sheets = np.zeros_like(term), np.zeros_like(of_sheets)
+    size, before, last, done = 0.0, np.zeros(0), np.abs(term).sum(axis=0), 0
+    while done < bounces and last.max() > _SMALL * size:
+        sent = returned * term
+        term = yield sent.astype(np.complex64)
+        if coupled is not None:
+            from_sheets = coupled.albedo * of_sheets
+            term = term + (to_groups @ from_sheets)[stand.group]
+            of_sheets = from_groups @ (stand.mean @ sent) + among @ from_sheets
+        total, total_sheets, done = total + term, total_sheets + of_sheets, done + 1
+        before, last = last, np.abs(term).sum(axis=0)
+        size = float(last.max()) if done == 1 else size
+    if done < bounces and (last < before).all():  # what is left falls off as a geometric series
+        rest = last / (before - last)
+        total, total_sheets = total + rest * term, total_sheets + rest * of_sheets
+    return total, total_sheets
+
+
+def _together(operator: Operator, nodes: Sequence[_Bounces]) -> list[tuple[NDArray[Any], NDArray[Any]]]:
+    """Let light bounce at all nodes at once; return what each returns."""
+    found: dict[int, tuple[NDArray[Any], NDArray[Any]]] = {}
+    arriving: dict[int, Any] = dict.fromkeys(range(len(nodes)))
+    while arriving:
+        leaving = {}
+        for k, arrived in arriving.items():
+            try:
+                leaving[k] = nodes[k].send(arrived)
+            except StopIteration as done:
+                found[k] = done.value
+        if not leaving:
+            break
+        arrived = operator @ np.concatenate(list(leaving.values()), axis=1)
+        arriving = dict(zip(leaving, np.split(arrived, len(leaving), axis=1), strict=True))
+    return [found[k] for k in range(len(nodes))]
 
 
 class _Coupled(NamedTuple):
