@@ -154,18 +154,19 @@ def test_a_dark_landmark_is_calibrated_on_the_little_that_it_returns():
     assert nees(found, truth) < stats.chi2.ppf(0.999, 3)
 
 
-def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_the_model_tells():
+@pytest.mark.parametrize("n", [3, pytest.param(5, marks=pytest.mark.soak)])
+def test_few_frames_without_amplitudes_have_the_noise_of_the_law_and_edges_that_the_model_tells(n):
     """Five frames do not tell their noise, so it says nothing of which pixels are faint.
 
     One calibration in six ends in a minimum beside the right one; its fit is poor, as that of all of them.
     Seed [77, 0] ends there.
     """
     values = []
-    for seed in range(5):
+    for seed in range(n):
         truth, poses, frames = recorded([77, 1 + seed], 8, n_frames=5, light=False)
         values.append(nees(calibrate(MESH, frames, poses, on="ranges"), truth))
     assert np.median(values) < stats.chi2.ppf(0.9, 7)
-    assert (np.array(values) < stats.chi2.ppf(0.999, 7)).sum() >= 4
+    assert (np.array(values) < stats.chi2.ppf(0.999, 7)).sum() >= n - 1
 
 
 def test_a_landmark_that_stands_on_the_floor_is_calibrated_with_the_floor_stated():
@@ -275,19 +276,21 @@ def test_a_wrong_pose_is_named():
     assert "scaled by χ²" in found.covariance_from
 
 
-def test_exchanged_poses_are_named_and_a_fit_without_a_model_is_doubted():
+@pytest.mark.parametrize("pair", [(2, 7), pytest.param((1, 5), marks=pytest.mark.soak)])
+def test_exchanged_poses_are_named_and_a_fit_without_a_model_is_doubted(pair):
     rng = np.random.default_rng([1, 3])
     truth, poses = some_mounting(rng), some_poses(rng, 10)
     frames = filtered(take(truth, poses, rng))
-    found = calibrate(MESH, frames, poses[np.array([0, 1, 7, 3, 4, 5, 6, 2, 8, 9])])
-    assert "times what noise leaves" in " ".join(found.doubts)
-    assert found.cause == "two poses are likely exchanged: pose 2 and pose 7"
-    # a fit that goes astray may end anywhere, as processors round: where nothing can be determined, too
+    order = np.arange(10)
+    order[list(pair)] = pair[::-1]
     try:
-        said = calibrate(MESH, frames, poses[np.array([0, 5, 2, 3, 4, 1, 6, 7, 8, 9])]).cause
-    except UsageError as error:
-        said = str(error)
-    assert "two poses are likely exchanged: pose 1 and pose 5" in said
+        found = calibrate(MESH, frames, poses[order])
+        said, doubts = found.cause, " ".join(found.doubts)
+    except UsageError as error:  # a fit that goes astray may end where nothing can be determined, as processors round
+        said, doubts = str(error), ""
+    assert f"two poses are likely exchanged: pose {pair[0]} and pose {pair[1]}" in said
+    if pair == (2, 7):
+        assert "times what noise leaves" in doubts
 
 
 def test_cartesian_poses_are_the_inverse_of_the_robot_equations():
@@ -1065,7 +1068,8 @@ def test_a_mistake_with_a_recording_is_named(kind):
 @pytest.mark.parametrize(
     ("kind", "part"),
     [
-        ("radians", "recording 2 differs from what"), ("x", "of recording 2, x of the poses"),
+        pytest.param("radians", "recording 2 differs from what", marks=pytest.mark.soak),
+        ("x", "of recording 2, x of the poses"),
         ("stamps", "recording 2: the frames have no time stamps"),
         ("twice", "recordings 1 and 2 have 40 frames in common"),
     ],
