@@ -419,7 +419,7 @@ class StandingLight:
         return solved
 
     def _lit(self, stand: Stand, view: StandingView) -> _Lit:
-        """Return what the lamp lights at a node, and what shares of the light return."""
+        """Return the light of the lamp at a node, and the shares of light that the patches return."""
         patches, sheets = stand.patches, self._sheets(view)
         whole = np.ones(len(patches))
         if sheets is not None:  # the floor of patches ends at the strip
