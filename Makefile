@@ -1,6 +1,6 @@
 # Every target sets itself up: a virtual environment in VENV, the package in it (editable), and then the work.
 #   make demo          the paper's experiment, with a report in out/demo
-#   make test          the tests (ARGS="-k name" for some of them), about twenty minutes on two cores
+#   make test          the tests (ARGS="-k name" for some of them), 7 to 20 minutes on two cores
 #   make lint types    style, import direction, types (of the tests too)
 #   make bench soak    speed; the long statistical and fault tables
 #   make figures       the pictures of the documentation
