@@ -531,6 +531,7 @@ def test_the_command_replays_a_recording(bank, printed, tmp_path, capsys):
     told = capsys.readouterr()
     assert len(told.out.splitlines()) == 10
     assert "jsonl:/dev/full: No space left on device; what was to be written there is not whole" in told.err
+    assert told.err.count("No space left on device") == 2  # a note when it happens, and the error at the end
     assert main([*words, "--delay-ms", "nan"]) == 2
     assert "--delay-ms must be from -10000 to 10000, got nan" in capsys.readouterr().err
     assert main(["live", str(path), "--landmark", "cone"]) == 2

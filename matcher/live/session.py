@@ -54,7 +54,7 @@ class Live:
         self.source, self.locator, self.sinks = source, locator, tuple(sinks)
         self.status = Status(source.name)
         self._delay_s, self._say = delay_s, say or (lambda line: None)
-        self._said = ""
+        self._said, self._failed = "", set[str]()
         self._stop = threading.Event()
         self._newest: queue.Queue[Arrival] = queue.Queue(1)
         self._is_over, self._error = threading.Event(), list[Exception]()
@@ -178,7 +178,7 @@ class Live:
         self._for_sinks(lambda sink: sink.status(self.status))
 
     def _for_sinks(self, act: Callable[[Sink], None]) -> None:
-        """Let each sink act; one that fails is said in a line, and used again with the next frame.
+        """Let each sink act; one that fails is said in a line, once, and used again with the next frame.
 
         The first failure of a disk is an error when the session is over.
         """
@@ -192,6 +192,6 @@ class Live:
                 if isinstance(error, BrokenPipeError) and sink.name == "-":  # nobody reads standard output any more
                     self._error.append(error)
                     self._stop.set()
-                elif line != self._said:
-                    self._said = line
+                elif line not in self._failed:
+                    self._failed.add(line)
                     self._say(line)
