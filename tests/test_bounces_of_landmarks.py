@@ -223,6 +223,18 @@ def test_a_box_before_a_wall_alone_returns_the_light_of_the_same_scene() -> None
     assert np.abs(known - direct).max() > 3e-3 * brightest
 
 
+def test_light_does_not_depend_on_which_nodes_are_computed_together(renderer: Renderer) -> None:
+    """All 16 around a view at once, or those alone that the view beside it left."""
+    behind = replace(BEHIND, bounces="all")
+    at_once = renderer.render(1.03, 0.05, background=behind).phasor
+    assert renderer._standing is not None
+    renderer._standing._nodes.clear()
+    renderer.render(1.12, 0.18, background=behind)
+    before = len(renderer._standing._nodes)
+    np.testing.assert_array_equal(renderer.render(1.03, 0.05, background=behind).phasor, at_once)
+    assert before < len(renderer._standing._nodes) < 2 * before  # some of them were there
+
+
 def test_renderers_of_a_landmark_share_its_patches_and_those_of_an_albedo_the_light(
     bank: Bank, renderer: Renderer
 ) -> None:

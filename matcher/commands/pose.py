@@ -79,9 +79,11 @@ def _truth_of(
 
     if not true.known.all():
         raise UsageError(f"{truth}: pose {int(np.argmin(true.known))} has an empty cell: every true pose must be whole")
-    if found.index is not None and len(np.unique(found.index)) < len(found):
-        twice = int(np.sort(found.index)[1:][np.diff(np.sort(found.index)) == 0][0])
-        raise UsageError(f"{estimates}: position {twice} has more than one estimate: give each once")
+    if found.index is not None:
+        positions, counts = np.unique(found.index, return_counts=True)
+        if len(positions) < len(found):
+            twice = int(positions[counts > 1][0])
+            raise UsageError(f"{estimates}: position {twice} has more than one estimate: give each once")
     by_position = true.time_s is None or found.time_s is None or len(true) == len(found)
     if by_position:
         index = np.arange(len(found)) if found.index is None else found.index

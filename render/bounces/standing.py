@@ -403,16 +403,12 @@ class StandingLight:
         is one product with a sparse matrix, which is read once.
         """
         lit = [self._lit(stand, view) for view in views]
-        found: list[list[tuple[NDArray[Any], NDArray[Any]]]] = [[] for _ in views]
-        for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True):
-            for own, light in zip(
-                found,
-                _together(operator, [_bounced(stand, one, wave_number, bounces) for one in lit]),
-                strict=True,
-            ):
-                own.append(light)
+        found = [
+            _together(operator, [_bounced(stand, one, wave_number, bounces) for one in lit])
+            for operator, wave_number in zip(stand.operators, self._wave_numbers, strict=True)
+        ]
         solved = []
-        for view, own in zip(views, found, strict=True):
+        for view, own in zip(views, zip(*found, strict=True), strict=True):
             scale = 1 / self._scale(view.distance_m)[:, :, None]
             at_patches, at_sheets = (np.array(each) * scale for each in zip(*own, strict=True))
             solved.append((at_patches.astype(np.complex64), at_sheets.astype(np.complex64)))
