@@ -116,7 +116,7 @@ def _counted() -> Iterator[list[float]]:
         counts[0] += _WITH_SLOPES * len(views)
         return with_slopes(self, views, *parameters, **options)
 
-    Renderer.render_views, Renderer.render_with_slopes = counting, counting_slopes  # type: ignore[method-assign,assignment]
+    Renderer.render_views, Renderer.render_with_slopes = counting, counting_slopes  # type: ignore[method-assign]
     try:
         yield counts
     finally:

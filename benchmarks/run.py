@@ -182,7 +182,7 @@ def lenses() -> Table:
     """Time views behind a lens with distortion beside those of the same pixels behind an ideal one, in turn."""
     rows = []
     for size, focal, n in (((16, 16), 41.0, 64), ((224, 171), 200.0, 4)):
-        matrix = [[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]]
+        matrix = np.array([[focal, 0, size[0] / 2 - 0.5], [0, focal, size[1] / 2 - 0.5], [0, 0, 1]])
         lens = Sensor.from_opencv(matrix, (-0.31, 0.12, 0.0012, -0.0008, -0.02), size=size)
         views = random_views(n)
         for name in catalog():

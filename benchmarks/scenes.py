@@ -52,6 +52,11 @@ def _at(place_m: tuple[float, float, float]) -> NDArray[np.float64]:
     return np.asarray(trimesh.transformations.translation_matrix(place_m))
 
 
+def _placed(body: Body) -> trimesh.Trimesh:
+    """Return the mesh of a body where it stands."""
+    return trimesh.Trimesh(body.mesh.vertices, body.mesh.faces, process=False).apply_transform(body.pose)
+
+
 def _timed(
     what: str, bodies: list[Body], sensor: Sensor, rays: int | None, median_seconds: Callable[..., float]
 ) -> list[dict[str, Any]]:
@@ -74,9 +79,11 @@ def _timed(
 
 def _dense(bodies: list[Body], sensor: Sensor) -> str:
     """Compare n × n rays a pixel of Embree with the exact frame: errors and times, one thread."""
-    renderer, camera = SceneRenderer(Scene(bodies), sensor), _at((-0.3, 0.0, 0.5))
-    exact = renderer.phasors(camera).phasor[0]
-    surface = renderer._assembly.in_facets().topology
+    camera = _at((-0.3, 0.0, 0.5))
+    exact = SceneRenderer(Scene(bodies), sensor).phasors(camera).phasor[0]
+    surface: Any = trimesh.util.concatenate([_placed(body) for body in bodies])
+    albedo = np.concatenate([np.broadcast_to(body.albedo, len(body.mesh.faces)) for body in bodies])
+    plane_m = np.einsum("ij,ij->i", surface.face_normals, surface.triangles[:, 0])
     caster = make_intersector(surface.vertices, surface.faces)
     tangent, found = math.tan(math.radians(sensor.half_angle_h_deg)), []
     for n in _DENSE:
@@ -86,10 +93,10 @@ def _dense(bodies: list[Body], sensor: Sensor) -> str:
         begun = time.perf_counter()
         face = caster.first_face(np.tile(camera[:3, 3], (len(rays), 1)).astype(np.float32), rays.astype(np.float32))
         met = np.maximum(face, 0)
-        facing = np.einsum("ij,ij->i", surface.planes[met, :3], rays)
-        along = (surface.planes[met, 3] - surface.planes[met, :3] @ camera[:3, 3]) / facing
+        facing = np.einsum("ij,ij->i", surface.face_normals[met], rays)
+        along = (plane_m[met] - surface.face_normals[met] @ camera[:3, 3]) / facing
         length = np.linalg.norm(rays, axis=1)
-        amplitude = np.where(face < 0, 0, surface.albedo[met] * np.abs(facing) / length / (along * length) ** 2)
+        amplitude = np.where(face < 0, 0, albedo[met] * np.abs(facing) / length / (along * length) ** 2)
         light = amplitude * np.exp(1j * along * length / sensor.metres_per_radian)
         phasor = light.reshape(sensor.rows, n, sensor.cols, n).mean(axis=(1, 3))
         seconds = time.perf_counter() - begun

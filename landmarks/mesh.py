@@ -120,6 +120,8 @@ def build_surface(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = 
     UsageError
         As :func:`build_mesh`.
     """
+    if not isinstance(spec, LandmarkSpec):
+        raise UsageError(f"'spec' must be a LandmarkSpec, got {type(spec).__name__}: catalog()['cone'] is one")
     if part not in ("both", "lower", "upper"):
         raise UsageError(f"'part' must be 'both', 'lower' or 'upper', got {part!r}")
     if not (math.isfinite(tolerance_m) and tolerance_m > 0):

@@ -163,9 +163,15 @@ class Matcher:
         workers: int | None = None,
         policy: SearchPolicy | None = None,
     ) -> None:
+        if not hasattr(bank, "sensor"):
+            raise UsageError(f"'bank' must be a bank, got {type(bank).__name__}: open_bank opens a file")
         _check_word("method", method, METHODS)
         _check_word("on", on, ("ranges", "phasors", "reported", *DIRECT_KINDS))
         _check_word("pixels", pixels, ("all", "lower"))
+        if not isinstance(robust, bool | np.bool_):
+            raise UsageError(f"'robust' must be True or False, got {robust!r}")
+        if workers is not None and not workers >= 1:
+            raise UsageError(f"'workers' must be at least 1, or None, got {workers!r}")
         if background is not None and not isinstance(background, Background):
             _check_word("background", background, ("auto", "unknown", "any"), "a Background, None, ")
         stated = {

@@ -106,6 +106,8 @@ class Renderer:
             raise UsageError(
                 f"'mesh' must be a mesh, got {type(mesh).__name__}: build_mesh makes one of a LandmarkSpec"
             )
+        if not hasattr(sensor, "harmonic_orders"):
+            raise UsageError(f"'sensor' must be a Sensor, got {type(sensor).__name__}: preset gives one by its name")
         if not 0 < albedo <= 1:
             raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
         max_splits = 4

@@ -94,6 +94,11 @@ class Views:
         Tilt of what the camera is mounted on: d_level = Ry(pitch) · Rx(roll) · d, a positive pitch looking down. The
         mount's own tilt (`pitch_deg` and `roll_deg` of the sensor) comes before it. None: level.
 
+    Raises
+    ------
+    UsageError
+        The fields are not of one length each.
+
     Notes
     -----
     A camera whose mount is not as drawn sees them turned and raised: :meth:`in_camera`.
@@ -110,6 +115,12 @@ class Views:
         for name in VIEW_FIELDS[4:]:
             if getattr(self, name) is None:
                 object.__setattr__(self, name, np.zeros(len(self.distance_m)))
+        shapes = {name: np.shape(getattr(self, name)) for name in VIEW_FIELDS}
+        if len({*shapes.values()}) > 1 or len(shapes["distance_m"]) != 1:
+            lengths = ", ".join(f"{name} {shape}" for name, shape in shapes.items())
+            raise UsageError(f"views need one array of n values each, got {lengths}: Views.broadcast takes numbers too")
+        for name in VIEW_FIELDS:
+            object.__setattr__(self, name, np.asarray(getattr(self, name), np.float64))
 
     def __repr__(self) -> str:
         """Describe in one line the number and the extent of the views, without parameters that are 0 in all of them."""

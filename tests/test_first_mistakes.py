@@ -52,6 +52,44 @@ def test_a_specification_is_no_mesh():
         Renderer(cone, SENSOR)
 
 
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (Renderer, (None, "pmd-16x16"), "'sensor' must be a Sensor, got str: preset gives one by its name"),
+        (Matcher, ("bank.h5",), "'bank' must be a bank, got str: open_bank opens a file"),
+        (Views, ([1, 2], [0.1], [0], [0]), r"views need one array of n values each, got .* \(2,\), .* \(1,\)"),
+        (build_mesh, ("cone",), r"'spec' must be a LandmarkSpec, got str: catalog\(\)\['cone'\] is one"),
+    ],
+)
+def test_a_name_or_a_list_in_place_of_what_it_stands_for_is_answered_in_words(function: Any, arguments, message):
+    with pytest.raises(UsageError, match=message):
+        function(*arguments)
+
+
+@pytest.mark.parametrize(("options", "message"), [({"robust": "no"}, "True or False"), ({"workers": 0}, "at least 1")])
+def test_switches_and_threads_of_a_matcher_are_what_they_say(bank, options, message):
+    with pytest.raises(UsageError, match=f"must be {message}"):
+        Matcher(bank, **options)
+
+
+def test_a_seed_is_no_generator(renderer):
+    seed: Any = 1
+    with pytest.raises(UsageError, match=r"'rng' must be a numpy.random.Generator, as .* got 1$"):
+        capture(renderer.render(1.0), SENSOR, rng=seed)
+
+
+@pytest.mark.parametrize("n_frames", [0, -3, np.array([[[np.nan]]])])
+def test_a_bound_is_of_frames(renderer, n_frames):
+    with pytest.raises(UsageError, match="'n_frames' must be at least 1, got"):
+        cramer_rao(renderer, Views.broadcast(1.0), n_frames=n_frames)
+
+
+def test_views_of_lists_are_those_of_arrays(renderer):
+    lists: Any = [1, 1.2], [0.1, 0], [0, 0], [0, 0]
+    expected = renderer.render([1.0, 1.2], [0.1, 0.0])
+    assert np.array_equal(renderer.render_views(Views(*lists)).phasor, expected.phasor)
+
+
 def test_a_bank_is_built_from_the_fields_of_its_plan_by_name(bank):
     plan = {"classes": ["cone"], "distance_m": "0.9:1.1:0.02", "delta_deg": "0:180:2"}
     with phasemark.build_bank(plan) as built:

@@ -448,3 +448,7 @@ def test_the_command_writes_a_line_a_stop(tmp_path: Path, capsys: pytest.Capture
     capsys.readouterr()
     assert main(["locate", *files, "--frames", "9", "-o", str(out), "--force"]) == 2
     assert "'frames' must be 1 … 1" in capsys.readouterr().err.replace("--frames", "'frames'")
+    assert main(["locate", *files, "--odometry", "--map-name", "b", "-o", str(out), "--force"]) == 2
+    assert "room.toml: holds one map alone, without a name" in capsys.readouterr().err
+    assert main(["locate", *files, files[2], "--odometry", "-o", str(out), "--force"]) == 2
+    assert f"run '{recording.run}' has stop 0 of robot 0 2 times" in capsys.readouterr().err

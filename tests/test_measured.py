@@ -66,6 +66,12 @@ def test_blank_and_nan_cells_are_invalid_and_mean_what_the_caller_says(tmp_path,
     assert frames.flags.tolist() == [[[[0, flag, flag], [flag, flag, 0]]]]
 
 
+def test_a_validity_that_is_not_a_number_marks_no_valid_pixel(tmp_path):
+    np.savez(tmp_path / "a.npz", range=np.ones((1, 2, 3)), valid=[[[1.0, 0.0, np.nan], [2.0, 1.0, 1.0]]])
+    frames = read_frames(tmp_path / "a.npz", sensor=SMALL, **STATED)
+    assert frames.valid.tolist() == [[[[True, False, False], [True, True, True]]]]
+
+
 @pytest.mark.parametrize("count", [255, 257])
 def test_a_csv_line_with_a_value_too_few_or_too_many_is_named(tmp_path, count):
     lines = [",".join(["1.5"] * n) for n in (256, 256, count)]

@@ -207,7 +207,7 @@ def frames_of(
     arrays = _shaped(raw, sensor, shape, path)
     valid = np.ones(arrays["range"].shape, dtype=bool)
     if "valid" in arrays:
-        valid &= arrays["valid"] != 0
+        valid &= np.nan_to_num(arrays["valid"]) != 0
     if "status" in arrays:
         valid_status = raw.valid_status if valid_status is None else valid_status
         if valid_status is None:

@@ -133,7 +133,7 @@ def cramer_rao(
     Raises
     ------
     UsageError
-        A name is unknown, or a wall is a nuisance where there is none.
+        A name is unknown, a wall is a nuisance where there is none, or a number of frames is not positive.
 
     Examples
     --------
@@ -144,6 +144,9 @@ def cramer_rao(
     >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
     [0.00036, 0.00531]
     """
+    counted = np.asarray(n_frames, np.float64)
+    if not np.all(counted > 0 if counted.ndim == 0 else counted >= 0):
+        raise UsageError(f"'n_frames' must be at least 1, got {counted.min():g}")
     if not isinstance(renderer, Renderer):
         if on != "ranges" or pixels != "all" or not set(nuisances or ()) <= {"wall_m"}:
             raise UsageError(

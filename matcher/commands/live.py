@@ -163,7 +163,7 @@ def _among_walls(
     found = open_rig_source(source, rig, in_time=in_time)
     recorded_in = found.recording.map_name if isinstance(found, RecordedRig) else None
     run = found.recording.run if isinstance(found, RecordedRig) else None
-    wall_map = read_wall_map(map_file, map_of_run(map_file, map_name or recorded_in, run))
+    wall_map = read_wall_map(map_file, map_of_run(map_file, recorded_in, run, map_name))
     return found, lambda: MapTracker(Locator(wall_map, rig), motion.speed, math.radians(motion.turn_rate))
 
 

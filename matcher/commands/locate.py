@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from phasemark.matcher.locate.locator import LocatedPose, Locator
     from phasemark.matcher.locate.recording import RigRecording
+    from phasemark.matcher.locate.rig import Rig
     from phasemark.matcher.locate.rig_calibration import RigCalibration
     from phasemark.matcher.locate.wall_map import WallMap
 
@@ -99,10 +100,9 @@ def locate_rig(
     rig, answers, drawn, robot_key = locate.read_rig(rig_file), [], [], "robot"
     std = (start_std, start_std, math.radians(start_yaw_std))
     with LongWork("locating"):
-        for path in recordings:
-            recording = locate.read_rig_recording(path, rig)
+        for recording in _recordings(recordings, rig):
             recording = recording if frames is None else recording.first_frames(frames)
-            name = map_of_run(map_file, map_name or recording.map_name, recording.run)
+            name = map_of_run(map_file, recording.map_name, recording.run, map_name)
             wall_map = locate.read_wall_map(map_file, name)
             limits = {"tolerance_m": tolerance, "tolerance_rad": math.radians(tolerance_yaw)}
             locator = locate.Locator(wall_map, rig, with_tilt=tilt, **limits)
@@ -188,7 +188,7 @@ def calibrate_rig_file(
     refuse_other_files(out, ".toml", "the rig")
     refuse_existing([out], force)
     rig = locate.read_rig(rig_file)
-    read = [locate.read_rig_recording(path, rig) for path in recordings]
+    read = _recordings(recordings, rig)
     maps, names = _maps(map_file, read)
     moved_maps = names if "walls" in (free or ()) else {}
     plain = [re.sub(r"[^\w.-]", "_", name) for name in moved_maps]
@@ -208,6 +208,15 @@ def calibrate_rig_file(
         return echo_json({"files": [str(path) for path in files], **found.as_dict()})
     _echo_rig(found)
     echo(*files)
+
+
+def _recordings(paths: Sequence[Path], rig: Rig) -> list[RigRecording]:
+    """Read recordings of a rig, each stop of which must be in one of them."""
+    from phasemark.matcher.locate.recording import refuse_stops_twice
+
+    read = [locate.read_rig_recording(path, rig) for path in paths]
+    refuse_stops_twice(read)
+    return read
 
 
 def _maps(map_file: Path, recordings: Sequence[RigRecording]) -> tuple[list[WallMap], dict[str, WallMap]]:

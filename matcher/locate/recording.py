@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -361,6 +362,22 @@ def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], 
             raise InputFileError(f"{where}: a second pose of stop {key[1]}")
         found[key] = np.array([x, y, np.radians(yaw)])
     return found
+
+
+def refuse_stops_twice(recordings: Sequence[RigRecording]) -> None:
+    """Refuse recordings of which two hold the same stop, which would count twice.
+
+    Raises
+    ------
+    UsageError
+    """
+    counted = Counter(recording.key(k) for recording in recordings for k in range(len(recording)))
+    for (run, stop, robot), times in counted.items():
+        if times > 1:
+            raise UsageError(
+                f"run '{run}' has stop {stop} of robot {robot} {times} times in the recordings: give each stop once,"
+                " and each run a name of its own"
+            )
 
 
 def poses_of(recording: RigRecording, table: Mapping[tuple[str, int, int], _Float]) -> _Float:

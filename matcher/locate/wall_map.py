@@ -305,9 +305,20 @@ class WallMap(PlanModel):
         return toml_text(self.model_dump(mode="json", by_alias=True, exclude_none=True, exclude_defaults=True))
 
 
-def map_of_run(path: str | os.PathLike[str], name: str | None, run: str | None) -> str | None:
-    """Return the name of a map in a file: the one that is given, or that of ``runs.RUN``; None where neither is."""
-    runs: Any = read_toml(Path(path)).get("runs")
+def map_of_run(
+    path: str | os.PathLike[str], recorded: str | None, run: str | None, asked: str | None = None
+) -> str | None:
+    """Return the name of a map in a file: the one asked for, the recording's, or that of ``runs.RUN``; None without.
+
+    Raises
+    ------
+    UsageError
+        A name is asked for, and the file holds one map alone.
+    """
+    table = read_toml(Path(path))
+    if asked is not None and "maps" not in table:
+        raise UsageError(f"{path}: holds one map alone, without a name, and none of [maps.{asked}]")
+    name, runs = asked or recorded, table.get("runs")
     return runs.get(run) if name is None and isinstance(runs, dict) else name
 
 

@@ -13,6 +13,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
+
 _MASK = np.uint64(0xFFFFFFFF)
 _HALF = np.uint64(32)
 _M0, _M1 = np.uint64(0xD2511F53), np.uint64(0xCD9E8D57)
@@ -57,6 +59,8 @@ def draw_key(rng: np.random.Generator) -> NDArray[np.uint64]:
     Drawing them, rather than spawning a child, works for every bit generator, advances `rng` by the same amount
     whatever is captured, and makes the next capture with the same `rng` independent of this one.
     """
+    if not isinstance(rng, np.random.Generator):
+        raise UsageError(f"'rng' must be a numpy.random.Generator, as numpy.random.default_rng(0), got {rng!r}")
     return rng.integers(0, 2**32, size=2, dtype=np.uint64)
 
 
