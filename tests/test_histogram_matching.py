@@ -34,7 +34,7 @@ from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.statistics import nees, view_errors
-from phasemark.render import Background, Frames, Views, preset
+from phasemark.render import Background, Frames, Views, capture, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
 from phasemark.render.direct.bin_counts import detected_counts, piled_up, signal_counts
 from phasemark.render.direct.expected_targets import expected_targets
@@ -155,6 +155,32 @@ def test_the_bearing_is_estimated_unless_the_matcher_is_told_and_lies_within_its
     assert (found.class_name == "cylinder").sum() >= 4
     assert (np.abs(error) < 5 * np.sqrt(np.einsum("npp->np", found.covariance))).all()
     assert found.accepted.sum() >= 3
+
+
+@pytest.fixture(scope="module")
+def roof_bank(tmp_path_factory):
+    """A box with a crooked roof, which looks much the same after half a turn."""
+    corners = [[x, y, z] for x in (-0.0871, 0.0871) for y in (-0.076, 0.076) for z in (-0.1409, 0.0512)]
+    roof = trimesh.convex.convex_hull(np.array([*corners, [0.0014, -0.0426, 0.1409], [0.0068, 0.0514, 0.1409]]))
+    folder = tmp_path_factory.mktemp("roof")
+    roof.export(folder / "roof.stl")
+    plan = {
+        "meshes": [{"name": "roof", "path": str(folder / "roof.stl"), "unit": "m"}], "sensor": SENSOR,
+        "distance_m": "0.6:0.86:0.02", "delta_deg": "0:360:3", "layout": "full",
+    }  # fmt: skip
+    with build_bank(plan, folder / "bank.h5") as bank:
+        yield bank
+
+
+@pytest.mark.parametrize("on", ["histograms", "targets"])
+def test_a_part_is_told_from_its_other_side_though_a_table_takes_that_for_nearer(roof_bank, on: Measured) -> None:
+    views = Views.broadcast([0.7324, 0.67, 0.6627], np.radians([213.47, 8.58, 23.49]), np.radians([4.3, 1.63, 1.77]))
+    counted = HistogramRenderer(roof_bank.mesh("roof"), roof_bank.sensor).render_views(views)
+    frames = capture(counted, roof_bank.sensor, rng=np.random.default_rng(6), n_frames=4)
+    found = Matcher(roof_bank, "refine", on=on).match(frames)
+    assert np.abs(found.distance_m - views.distance_m).max() < 0.005
+    assert np.abs(np.remainder(found.delta_rad - views.delta_rad + np.pi, 2 * np.pi) - np.pi).max() < math.radians(3)
+    assert found.accepted.sum() >= (3 if on == "histograms" else 2)
 
 
 def test_height_and_pitch_are_estimated_on_request_and_a_wrong_hill_is_refused() -> None:

@@ -131,6 +131,8 @@ class Fit(NamedTuple):
         Expected counts, pile-up included.
     information : (p, p) float64
         Brightness, ambient light and nuisances eliminated, what was known before included.
+    settled : bool
+        Whether another scene would change nothing: not of a fit that ran out of scenes.
     """
 
     state: NDArray[np.float64]
@@ -140,6 +142,7 @@ class Fit(NamedTuple):
     cost: float
     level: NDArray[np.float64]
     information: NDArray[np.float64]
+    settled: bool = False
 
     @property
     def view(self) -> NDArray[np.float64]:
@@ -196,7 +199,7 @@ def fit_view(
         state, bright, ambient = search.moved(state, step), there.bright, there.ambient
         settled = (np.abs(step[n_free:]) <= _SETTLED * search.longest[n_free:]).all()
         if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < near_enough**2:
-            return there.fit(state, there.view_information)
+            return there.fit(state, there.view_information)._replace(settled=True)
         near = (np.abs(state[: len(VIEW_FIELDS)] - other) < _SAME for other in known)
         if there.cost > hopeless or any(one.all() for one in near):
             return None

@@ -24,6 +24,8 @@ from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
 _SAME_M, _SAME_RAD = 0.02, math.radians(5.0)
+_MORE = 4.0
+"""How far a table may be wrong about another hill, over how far it was off for those that were followed."""
 _OWN = VIEW_FIELDS[:3]
 _NEAR = np.array([0.05, *[math.radians(15.0)] * 2, 0.0, 0.0, 0.0])
 """What a frame by itself may have otherwise than all frames together, and how far."""
@@ -47,26 +49,25 @@ class HistogramMatcher(HistogramSearch):
         starts, bare = self.looked(frame)
         if not starts:
             return no_answer(self.rules)
-        least = starts[0].cost
         fits: Found = []
-        offset, margin, n_tried = 0.0, SURE_COST, 0
-        # how far the table may be wrong about another hill, over how far it was off for the best one
-        table_error = 4.0
-        most_fits = 8
-        for start in starts[:most_fits]:
-            if fits and start.cost > least + margin:
-                break
-            n_tried += 1
-            if not _follow(fits, self.searches[start.class_index], frame, start):
-                continue
-            if len(fits) == 1:
-                offset = fits[0][1].cost - least  # of the exact deviance over that of the table
-                margin += table_error * abs(offset)
-        others = [Explanation(one.class_index, one.view, one.cost + offset, None) for one in starts[n_tried:]]
+        error, left = 0.0, list(starts)
+        while left and (not fits or left[0].cost < starts[0].cost + SURE_COST + _MORE * error or self._is_poor(fits)):
+            start = left.pop(0)
+            if _follow(fits, self.searches[start.class_index], frame, start):
+                error = max(error, abs(fits[-1][1].cost - start.cost))
+        others = [Explanation(one.class_index, one.view, one.cost - error, None) for one in left]
+        test, estimated = self._tested(fits)
+        return self._answer(fits, others, test, bare, estimated, self.background_of(_best(fits)[1].state))
+
+    def _tested(self, fits: Found) -> tuple[FitTest, int]:
+        """Return the test of the best fit of a frame, and how many numbers it estimates."""
         best_class, best = _best(fits)
-        estimated = _estimated(self.searches[best_class], frame)
-        test = FitTest(*deviance_test(best.deviance, *moments_of(best.level), estimated))
-        return self._answer(fits, others, test, bare, estimated, self.background_of(best.state))
+        estimated = _estimated(self.searches[best_class], best)
+        return FitTest(*deviance_test(best.deviance, *moments_of(best.level), estimated)), estimated
+
+    def _is_poor(self, fits: Found) -> bool:
+        """Whether no fit explains the frame: a hill that the table undervalues may."""
+        return self._tested(fits)[0].p_value < self.rules.false_alarm
 
     def match_jointly(self, frames: HistogramFrames, first2camera: NDArray[np.float64]) -> Match:
         """Return one answer for a landmark that several positions see, the view as the first one has it.
@@ -101,7 +102,7 @@ class HistogramMatcher(HistogramSearch):
             for start in [start for start in first if start.class_index == c][:of_class]:
                 _follow(fits, search, joint, start)
         best_class, best = _best(fits)
-        estimated = _estimated(searches[best_class], joint)
+        estimated = _estimated(searches[best_class], best)
         apart = self._best_apart(counted, models[best_class], first2camera, best)
         test = _joint_test(best, joint, estimated, apart, len(_OWN) * len(counted) - len(self.free))
         return self._answer(fits, (), test, sum(bare), estimated, None)
@@ -161,10 +162,12 @@ class HistogramMatcher(HistogramSearch):
 
 
 def _follow(fits: Found, search: Search, frame: Counted, start: Start) -> bool:
-    """Fit a view from a start and add it to the others; returns False where the fit was given up."""
-    hopeless = min((fit.cost for _, fit in fits), default=math.inf) + SURE_COST
+    """Fit a view from a start and add it to the others; returns False where it ends in one of them."""
     known = [fit.view for other, fit in fits if other == start.class_index]
-    fit = fit_view(search, frame, start, SCENES, hopeless, known)
+    fit = fit_view(search, frame, start, SCENES, known=known)
+    if fit is not None and not fit.settled:
+        again = start._replace(state=fit.state, bright=fit.bright, ambient=fit.ambient)
+        fit = min(fit, fit_view(search, frame, again, SCENES) or fit, key=lambda one: one.cost)
     if fit is not None:
         fits.append((start.class_index, fit))
     return fit is not None
@@ -175,9 +178,9 @@ def _best(fits: Found) -> tuple[int, Fit]:
     return min(fits, key=lambda pair: pair[1].cost)
 
 
-def _estimated(search: Search, frame: Counted) -> int:
+def _estimated(search: Search, fit: Fit) -> int:
     """Return how many numbers a fit estimates: with those of the search, brightness and the ambient light of zones."""
-    return len(search.columns) + 1 + len(frame.counts)
+    return len(search.columns) + 1 + len(fit.ambient)
 
 
 def _is_same(view: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
