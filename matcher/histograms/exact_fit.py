@@ -19,6 +19,7 @@ _INNER_SHARES = (1.0, 0.3, 0.09, 0.027)
 _SETTLED = 0.05
 """A nuisance that moves by less than this share of its longest step needs no other scene."""
 _SHRINK, _LEAST_SHRINK = 0.3, 0.05
+_SCENES_OF_HOPE = 2  # by these no fit is given up
 _SAME = np.array([0.005, *[math.radians(1.0)] * 2, 0.005, *[math.radians(1.0)] * 2])
 """A fit this near to another one, on its way, ends where that one did."""
 LONGEST = {"m": 0.04, "rad": math.radians(4.0)}
@@ -164,7 +165,7 @@ def fit_view(
     most : int
         Scenes with slopes that are rendered at most.
     hopeless : float
-        A fit that will cost more than this is given up.
+        A fit that will cost more than this after its third scene is given up: the first ones tell little.
     known : sequence of (6,) float64
         Views that are fitted already: a fit that comes to one of them is given up.
 
@@ -182,7 +183,7 @@ def fit_view(
     # A step shorter than this share of a standard deviation needs no other scene: slopes are straight over it.
     near_enough = 0.7
     worse = 0.5  # Accept a scene whose cost exceeds its linear prediction by at most this: no test can see less.
-    for _ in range(most):
+    for n in range(most):
         here = _linear_scene(search, frame, state, bright, ambient)
         if best is not None and here.cost > best.cost + worse:
             shrink *= _SHRINK
@@ -201,7 +202,7 @@ def fit_view(
         if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < near_enough**2:
             return there.fit(state, there.view_information)._replace(settled=True)
         near = (np.abs(state[: len(VIEW_FIELDS)] - other) < _SAME for other in known)
-        if there.cost > hopeless or any(one.all() for one in near):
+        if (n >= _SCENES_OF_HOPE and there.cost > hopeless) or any(one.all() for one in near):
             return None
     return best
 

@@ -24,8 +24,10 @@ from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
 _SAME_M, _SAME_RAD = 0.02, math.radians(5.0)
-_MORE = 4.0
-"""How far a table may be wrong about another hill, over how far it was off for those that were followed."""
+_FEWEST, _MORE = 4, 4.0
+"""Hills that are followed at least; how far a table may be wrong about others, over how far it was off for these."""
+_HOPELESS = 500.0
+"""A fit that costs so much more than the best one after its third scene is given up."""
 _OWN = VIEW_FIELDS[:3]
 _NEAR = np.array([0.05, *[math.radians(15.0)] * 2, 0.0, 0.0, 0.0])
 """What a frame by itself may have otherwise than all frames together, and how far."""
@@ -51,7 +53,10 @@ class HistogramMatcher(HistogramSearch):
             return no_answer(self.rules)
         fits: Found = []
         error, left = 0.0, list(starts)
-        while left and (not fits or left[0].cost < starts[0].cost + SURE_COST + _MORE * error or self._is_poor(fits)):
+        while left:
+            likely = left[0].cost < starts[0].cost + SURE_COST + _MORE * error
+            if len(starts) - len(left) >= _FEWEST and not likely and not self._is_poor(fits):
+                break
             start = left.pop(0)
             if _follow(fits, self.searches[start.class_index], frame, start):
                 error = max(error, abs(fits[-1][1].cost - start.cost))
@@ -163,8 +168,9 @@ class HistogramMatcher(HistogramSearch):
 
 def _follow(fits: Found, search: Search, frame: Counted, start: Start) -> bool:
     """Fit a view from a start and add it to the others; returns False where it ends in one of them."""
+    hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _HOPELESS
     known = [fit.view for other, fit in fits if other == start.class_index]
-    fit = fit_view(search, frame, start, SCENES, known=known)
+    fit = fit_view(search, frame, start, SCENES, hopeless, known)
     if fit is not None and not fit.settled:
         again = start._replace(state=fit.state, bright=fit.bright, ambient=fit.ambient)
         fit = min(fit, fit_view(search, frame, again, SCENES) or fit, key=lambda one: one.cost)

@@ -146,7 +146,7 @@ class HistogramSearch(DirectMatcher):
         self, frame: Counted, counts: NDArray[np.float64], ambient: NDArray[np.float64]
     ) -> Iterator[Start]:
         """Yield hills of the likelihood of a landmark before planes; counts without pile-up and drift."""
-        hopeless, nothing_known = math.inf, np.full(2, math.inf)
+        nothing_known = np.full(2, math.inf)
         for bearing, table, lights in zip(self._bearings_rad, self.tables, self._lights, strict=True):
             for w in self._likely_walls(frame, counts, ambient, lights):
                 for hill in find_hills_before(table, counts, ambient, frame.extra, frame.n_frames, lights[w]):
@@ -155,10 +155,9 @@ class HistogramSearch(DirectMatcher):
                                   hill.bright, ambient)  # fmt: skip
                     model = TableModel(table, hill.class_index, lights[w])
                     search = Search(model, VIEW_FIELDS[:2], nothing_known, self.limits)
-                    fit = fit_view(search, frame, start, _TABLE_SCENES, hopeless)
+                    fit = fit_view(search, frame, start, _TABLE_SCENES)
                     if fit is None:
                         continue
-                    hopeless = min(hopeless, fit.cost + DESCENT_MARGIN)
                     state = self._with_wall(fit.state, w)
                     yield Start(hill.class_index, state, fit.cost + self._prior_of(bearing), fit.bright, fit.ambient)
 
