@@ -71,7 +71,7 @@ class HistogramMatcher(HistogramSearch):
         return FitTest(*deviance_test(best.deviance, *moments_of(best.level), estimated)), estimated
 
     def _is_poor(self, fits: Found) -> bool:
-        """Whether no fit explains the frame: a hill that the table undervalues may."""
+        """Return whether no fit explains the frame: a hill that the table undervalues may."""
         return self._tested(fits)[0].p_value < self.rules.false_alarm
 
     def match_jointly(self, frames: HistogramFrames, first2camera: NDArray[np.float64]) -> Match:
