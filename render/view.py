@@ -114,7 +114,7 @@ class Views:
     def __post_init__(self) -> None:
         for name in VIEW_FIELDS[4:]:
             if getattr(self, name) is None:
-                object.__setattr__(self, name, np.zeros(len(self.distance_m)))
+                object.__setattr__(self, name, np.zeros(np.shape(self.distance_m)))
         shapes = {name: np.shape(getattr(self, name)) for name in VIEW_FIELDS}
         if len({*shapes.values()}) > 1 or len(shapes["distance_m"]) != 1:
             lengths = ", ".join(f"{name} {shape}" for name, shape in shapes.items())

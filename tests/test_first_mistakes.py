@@ -58,6 +58,7 @@ def test_a_specification_is_no_mesh():
         (Renderer, (None, "pmd-16x16"), "'sensor' must be a Sensor, got str: preset gives one by its name"),
         (Matcher, ("bank.h5",), "'bank' must be a bank, got str: open_bank opens a file"),
         (Views, ([1, 2], [0.1], [0], [0]), r"views need one array of n values each, got .* \(2,\), .* \(1,\)"),
+        (Views, (1.0, 0.1, 0.0, 0.0), r"views need one array of n values each, got distance_m \(\)"),
         (build_mesh, ("cone",), r"'spec' must be a LandmarkSpec, got str: catalog\(\)\['cone'\] is one"),
     ],
 )

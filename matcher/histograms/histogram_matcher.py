@@ -167,7 +167,7 @@ class HistogramMatcher(HistogramSearch):
 
 
 def _follow(fits: Found, search: Search, frame: Counted, start: Start) -> bool:
-    """Fit a view from a start and add it to the others; returns False where it ends in one of them."""
+    """Fit a view from a start and add it to the others; returns False where it was given up."""
     hopeless = min((fit.cost for _, fit in fits), default=math.inf) + _HOPELESS
     known = [fit.view for other, fit in fits if other == start.class_index]
     fit = fit_view(search, frame, start, SCENES, hopeless, known)
