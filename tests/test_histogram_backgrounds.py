@@ -22,6 +22,7 @@ from scipy.stats import binom, chi2
 
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import cramer_rao
+from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Views
 from phasemark.render.direct.footprints import footprint_grid
@@ -89,6 +90,18 @@ def test_a_landmark_that_stands_alone_is_found_by_who_expects_a_wall() -> None:
     right = np.abs(view_errors(found, views, FREE, np.pi)) < [0.01, math.radians(6)]
     assert right[found.accepted].all()
     assert found.accepted.sum() >= 3
+
+
+def test_how_much_a_landmark_hides_of_a_wall_does_not_depend_on_the_walls_distance() -> None:
+    shares = []
+    for stated in (WALL, Background(wall_m=2.4), "auto"):
+        direct = matcher_of(stated)._direct
+        assert isinstance(direct, HistogramMatcher)
+        shares.append(direct.tables[0].visible)
+    near, far, free = shares
+    assert near.min() < 0.01
+    np.testing.assert_allclose(far, near, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(free, near, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("each", [1, pytest.param(20, marks=pytest.mark.soak)])

@@ -59,7 +59,9 @@ class DirectMatcher:
         far_m = histogram.start_m + histogram.bins * histogram.bin_width_m
         nearest_wall_m = 0.1
         self.free_wall = (nearest_wall_m, far_m) if background == "auto" else None
-        behind = Background(wall_m=far_m) if isinstance(background, str) else background
+        reach_m = max(float(np.hypot(*one.vertices[:, :2].T).max()) for one in self.signals)
+        behind_all = Background(wall_m=min(float(self.grid.distance_m[-1]) + reach_m, far_m))
+        behind = behind_all if isinstance(background, str) else background
         self.background = behind if planes_of(behind) else None
         self.limits = _view_limits(self.grid, None if self.free_wall else self.background)
 

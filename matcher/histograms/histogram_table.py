@@ -160,6 +160,7 @@ def build_table(
     coarse_m = 1.0  # shares of planes need no ranges: cells of a floor are not cut
     if background is not None:
         whole = plane_light(ViewSignals(None, sensor), background, bearing_rad, coarse_m).sum(axis=-1)
+        lit = whole > _DARK * whole.max()  # elsewhere a share is of the edge of a response, and matters to nothing
     for c, one in enumerate(signals):
         for i, (distance_m, first) in enumerate(zip(grid.distance_m, grid.first_bin.tolist(), strict=True)):
             views = Views.broadcast(distance_m, grid.delta_rad, bearing_rad)
@@ -167,7 +168,8 @@ def build_table(
                 counts = one.counts(views, workers)
             else:
                 found = one.surfaces(views, background, workers, finest_m=coarse_m)
-                counts, visible[c, i] = found[:, 0], found[:, planes].sum(axis=-1) / np.maximum(whole, 1e-300)
+                counts, light = found[:, 0], found[:, planes].sum(axis=-1)
+                visible[c, i] = np.divide(light, whole, out=np.ones_like(light), where=lit)
             low, high = max(first, 0), min(first + window, bins)
             signal[c, i, :, :, low - first : high - first] = counts[:, :, low:high]
     u = (np.arange(window) + 0.5 - window / 2) / (window / 2)
