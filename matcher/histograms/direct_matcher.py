@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.matcher.estimate.acceptance import Rules
-from phasemark.matcher.histograms.histogram_table import Table, TableGrid, build_table, plan_table
+from phasemark.matcher.histograms.histogram_table import TableGrid, plan_table
 from phasemark.matcher.histograms.scene_models import planes_of
 from phasemark.render import Background, Sensor
 from phasemark.render.direct.bin_counts import response_share
@@ -42,6 +42,8 @@ class DirectMatcher:
         Threads; the answers do not depend on their number.
     """
 
+    _tables_aside = 1  # tables of a free bearing to either side
+
     def __init__(
         self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
         background: Background | Literal["auto"] | None = None, workers: int = 1,
@@ -65,18 +67,19 @@ class DirectMatcher:
         self.background = behind if planes_of(behind) else None
         self.limits = _view_limits(self.grid, None if self.free_wall else self.background)
 
-    def _built_table(self, bearing_rad: float) -> Table:
-        """Render histograms on the grid."""
-        return build_table(self.signals, self.grid, self.background, bearing_rad, self.workers)
-
     @property
     def _bearings_rad(self) -> tuple[float, ...]:
-        """Bearings at which a table is made."""
+        """Bearings at which a table is made, 0 first."""
         if "bearing_rad" not in self.free:
             return (0.0,)
-        bearing_sigma = 2.0  # A free bearing has two further tables of histograms, as far aside as these say.
+        bearing_sigma = 2.0  # how far aside the tables of a free bearing reach
         side = min(bearing_sigma * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
-        return (0.0, -side, side)
+        aside = side / self._tables_aside * np.arange(1, self._tables_aside + 1)
+        return (0.0, *(float(sign * bearing) for bearing in aside for sign in (-1, 1)))
+
+    def _prior_of(self, bearing_rad: float) -> float:
+        """Return what a bearing costs before the frame is seen."""
+        return (bearing_rad / float(self.prior_std[self.free.index("bearing_rad")])) ** 2 if bearing_rad else 0.0
 
 
 def check_histogram_sensor(bank: Bank) -> None:

@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from phasemark.matcher.histograms.direct_matcher import DirectMatcher
 from phasemark.matcher.histograms.exact_fit import Counted, Fit, Search, Start, fit_view
-from phasemark.matcher.histograms.histogram_table import Table, cubic, plane_light, response_width_m, signal_between
+from phasemark.matcher.histograms.histogram_table import (
+    Table,
+    build_table,
+    cubic,
+    plane_light,
+    response_width_m,
+    signal_between,
+)
 from phasemark.matcher.histograms.poisson_fit import bare_deviance
 from phasemark.matcher.histograms.scene_models import FAINTEST, STRONGEST, LandmarkModel, planes_of
 from phasemark.matcher.histograms.table_search import DESCENT_MARGIN, ambient_light, find_hills, find_hills_before
@@ -74,7 +81,10 @@ class HistogramSearch(DirectMatcher):
     @cached_property
     def tables(self) -> list[Table]:
         """Histograms on a grid, one table for each bearing; rendered when they are first needed."""
-        return [self._built_table(bearing) for bearing in self._bearings_rad]
+        return [
+            build_table(self.signals, self.grid, self.background, bearing, self.workers)
+            for bearing in self._bearings_rad
+        ]
 
     @cached_property
     def models(self) -> list[LandmarkModel]:
@@ -128,10 +138,6 @@ class HistogramSearch(DirectMatcher):
         hills = self._hills if self.background is None else self._hills_before_planes
         starts = sorted(hills(frame, counts, ambient), key=lambda start: start.cost)
         return starts, self._bare_cost(frame, ambient) if starts else 0.0
-
-    def _prior_of(self, bearing_rad: float) -> float:
-        """Return what a bearing costs before the frame is seen."""
-        return (bearing_rad / float(self.prior_std[self.free.index("bearing_rad")])) ** 2 if bearing_rad else 0.0
 
     def _hills(self, frame: Counted, counts: NDArray[np.float64], ambient: NDArray[np.float64]) -> Iterator[Start]:
         """Yield hills of the likelihood of a landmark alone; counts without pile-up and drift."""

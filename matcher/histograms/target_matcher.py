@@ -23,7 +23,8 @@ from phasemark.matcher.estimate.solver import descend
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.direct_matcher import DirectMatcher
 from phasemark.matcher.histograms.exact_fit import LONGEST
-from phasemark.matcher.histograms.histogram_table import plane_light
+from phasemark.matcher.histograms.histogram_table import TableGrid, build_table, plane_light
+from phasemark.matcher.histograms.scene_models import planes_of
 from phasemark.matcher.histograms.target_costs import nearest_targets, node_costs
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
@@ -40,8 +41,8 @@ from phasemark.render.view import VIEW_FIELDS
 _ASIDE_RAD = math.radians(6.0)
 _WORTH_ANOTHER_TRY = 2 * DISAGREEMENT
 _STARTS, _FIRST_STEPS, _FOLLOWED, _STEPS, _SHARES = 24, 2, 6, 6, (1.0, 0.3)
-"""On 139 of 144 frames of six random parts a start led to the right hill; it was one of the first 23 of the table, for
-which every bearing is 0, and after two steps one of the six best."""
+"""Of 60 frames of five random parts a start led to the right hill on 58: one of the first 12."""
+_EVERY = 2  # targets are looked up at every second distance of the grid: a start may lie between them
 _APART_RAD = math.radians(5.0)
 """Between starts of a class."""
 _DONE = 0.01  # squared standard deviations
@@ -68,6 +69,26 @@ class Reported(NamedTuple):
     distance_m: NDArray[np.float64]
     std_m: NDArray[np.float64]
     n_frames: int
+
+
+class _Table(NamedTuple):
+    """Targets that are expected at one bearing.
+
+    Parameters
+    ----------
+    bearing_rad : float
+    distance_m : (classes, distances, angles, zones, targets) float32
+        At the nodes of a grid.
+    sure : (classes, distances, angles, zones, targets) bool
+        Which of them every frame reports.
+    alone : ExpectedTargets
+        Of the planes without a landmark.
+    """
+
+    bearing_rad: float
+    distance_m: NDArray[np.float32]
+    sure: NDArray[np.bool_]
+    alone: ExpectedTargets
 
 
 class _Comparison(NamedTuple):
@@ -117,28 +138,44 @@ class TargetMatcher(DirectMatcher):
     Albedos of a background are as stated, for targets do not tell them.
     """
 
+    _tables_aside = 2  # a degree apart: edges of zones are sharp
+
     @property
     def table_bytes(self) -> int:
-        """How large the histograms are that the table of targets is made of; they are not kept."""
-        return self.grid.n_bytes(self.sensor, len(self.signals), 0)
+        """How large the tables of targets are in memory, with the histograms that one of them is made of."""
+        counts = self._nodes.n_bytes(self.sensor, len(self.signals), len(planes_of(self.background)))
+        n_nodes = len(self._bearings_rad) * len(self.signals) * self._nodes.distance_m.size * self._nodes.delta_rad.size
+        of_target = np.dtype(np.float32).itemsize + np.dtype(np.bool_).itemsize
+        return counts + of_target * n_nodes * self.sensor.rows * self.sensor.cols * most_peaks(self.sensor)
 
     @cached_property
-    def table(self) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Targets that are expected on the grid, (classes, distances, angles, zones, targets), and which are sure."""
-        counts = self._built_table(0.0)
+    def _nodes(self) -> TableGrid:
+        """Where targets are looked up."""
+        return self.grid._replace(distance_m=self.grid.distance_m[::_EVERY], first_bin=self.grid.first_bin[::_EVERY])
+
+    @cached_property
+    def tables(self) -> list[_Table]:
+        """Targets that are expected on the grid, one table for each bearing."""
+        return [self._built_table(bearing) for bearing in self._bearings_rad]
+
+    def _built_table(self, bearing_rad: float) -> _Table:
+        """Render histograms and keep the targets that are expected of them."""
+        counts = build_table(self.signals, self._nodes, self.background, bearing_rad, self.workers)
         shape = (*counts.signal.shape[:4], most_peaks(self.sensor))
         distance, sure = np.empty(shape, np.float32), np.empty(shape, np.bool_)
         bins = histogram_of(self.sensor).bins
+        light = np.zeros((0, shape[3], bins))
+        if self.background is not None:
+            light = plane_light(self.nothing, self.background, bearing_rad)
         for c in range(shape[0]):
             for i, first in enumerate(counts.first_bin.tolist()):
-                low, high = max(first, 0), min(first + self.grid.window, bins)
+                low, high = max(first, 0), min(first + self._nodes.window, bins)
                 signal = np.zeros((shape[2], shape[3], bins))
                 signal[:, :, low:high] = counts.signal[c, i, :, :, low - first : high - first]
-                if self.background is not None:
-                    signal += np.einsum("jpz,pzb->jzb", counts.visible[c, i].astype(np.float64), self._light)
+                signal += np.einsum("jpz,pzb->jzb", counts.visible[c, i].astype(np.float64), light)
                 found = self._expected(signal)
                 distance[c, i], sure[c, i] = found.distance_m, found.sure
-        return distance, sure
+        return _Table(bearing_rad, distance, sure, self._expected(light.sum(axis=0)[None]))
 
     def match(self, targets: Targets) -> list[Match]:
         """Return an answer for every position.
@@ -154,7 +191,7 @@ class TargetMatcher(DirectMatcher):
                 f"the targets are of {rows} × {cols} zones, but the bank's sensor has {self.sensor.rows} ×"
                 f" {self.sensor.cols}"
             )
-        _ = self.table, self._still  # rendered before threads ask for them
+        _ = self.tables  # rendered before threads ask for them
         return mapped(self._match, [self._reported(targets, k) for k in range(len(targets.distance_m))], self.workers)
 
     def _reported(self, targets: Targets, k: int) -> Reported:
@@ -184,7 +221,7 @@ class TargetMatcher(DirectMatcher):
     def _match(self, frame: Reported) -> Match:
         if not len(frame.zone):
             return no_answer(self.rules)
-        begun = [self._fit(self._at_best_bearing(frame, *start), _FIRST_STEPS) for start in self._starts(frame)]
+        begun = [self._fit(_Fit(self, frame, *start), _FIRST_STEPS) for start in self._starts(frame)]
         begun.sort(key=lambda fit: fit.cost)
         fits = [self._fit(fit) for fit in begun[:_FOLLOWED]]
         fits += self._beside(frame, fits)
@@ -203,27 +240,10 @@ class TargetMatcher(DirectMatcher):
 
     def _bare_cost(self, frame: Reported) -> float:
         """Return what a scene without a landmark costs."""
-        if self.background is None:
-            return _unexplained_cost(len(frame.zone), frame.n_frames * self._false_targets)
-        return self._compared(frame, self._planes_alone, _NO_STEPS).cost
-
-    @cached_property
-    def _light(self) -> NDArray[np.float64]:
-        """Counts of the planes alone, (planes, zones, bins)."""
-        assert self.background is not None
-        return plane_light(self.nothing, self.background, 0.0)
-
-    @cached_property
-    def _planes_alone(self) -> ExpectedTargets:
-        """Targets that are expected of the planes alone."""
-        return self._expected(self._light.sum(axis=0)[None])
-
-    @cached_property
-    def _still(self) -> NDArray[np.float64]:
-        """Targets that do not move with the landmark, (zones, targets)."""
-        if self.background is None:
-            return np.full((self.sensor.rows * self.sensor.cols, 1), np.nan)
-        return np.asarray(self._planes_alone.distance_m[0])
+        return min(
+            self._prior_of(table.bearing_rad) + self._compared(frame, table.alone, _NO_STEPS).cost
+            for table in self.tables
+        )
 
     def _counts(self, c: int, views: Views) -> NDArray[np.float64]:
         """Return the signal counts of a class at some views, with what stands behind it; (n, zones, bins)."""
@@ -233,34 +253,31 @@ class TargetMatcher(DirectMatcher):
 
     def _starts(self, frame: Reported) -> list[tuple[int, NDArray[np.float64]]]:
         """Return the views that explain the targets best, each at an angle of its own of its class, best first."""
-        distance, sure = self.table
-        cost, shift = np.empty(distance.shape[:3]), np.empty(distance.shape[:3])
-        step = float(self.grid.distance_m[1] - self.grid.distance_m[0])
+        distance_m, delta_rad = self._nodes.distance_m, self._nodes.delta_rad
+        step = float(distance_m[1] - distance_m[0])
         # how far a target may be off between nodes of the table: added to sigmas in the search alone
         grid_std_m = 0.01
-        variance = frame.std_m**2 + grid_std_m**2
-        node_costs(distance, sure, frame.zone, frame.distance_m, 1 / variance, frame.n_frames, step,
-                   self._still, np.empty(len(frame.zone)), np.empty(len(frame.zone)), np.empty(distance.shape[3:]),
-                   cost, shift)  # fmt: skip
+        weight = 1 / (frame.std_m**2 + grid_std_m**2)
+        shape = (len(self.tables), len(self.signals), len(distance_m), len(delta_rad))
+        cost, shift = np.empty(shape), np.empty(shape)
+        for b, table in enumerate(self.tables):
+            node_costs(table.distance_m, table.sure, frame.zone, frame.distance_m, weight, frame.n_frames, step,
+                       table.alone.distance_m[0], np.empty(len(frame.zone)), np.empty(len(frame.zone)),
+                       np.empty(table.sure.shape[3:]), cost[b], shift[b])  # fmt: skip
+            cost[b] += self._prior_of(table.bearing_rad)
         starts: list[tuple[int, NDArray[np.float64]]] = []
-        lowest = cost.min(axis=1)
+        lowest = cost.min(axis=(0, 2))
         for c, j in np.column_stack(np.unravel_index(np.argsort(lowest, axis=None), lowest.shape)).tolist():
-            i = int(cost[c, :, j].argmin())
-            view = np.array([self.grid.distance_m[i] + shift[c, i, j], self.grid.delta_rad[j], 0.0, 0.0, 0.0, 0.0])
-            turn = [math.remainder(view[1] - other[1], 2 * math.pi) for d, other in starts if d == c]
-            if all(abs(angle) > _APART_RAD for angle in turn):
-                starts.append((c, np.clip(view, *self.limits)))
+            turn = [math.remainder(delta_rad[j] - other[1], 2 * math.pi) for d, other in starts if d == c]
+            if any(abs(angle) <= _APART_RAD for angle in turn):
+                continue
+            best, i = np.unravel_index(cost[:, c, :, j].argmin(), shape[::2])
+            bearing_rad = self.tables[int(best)].bearing_rad
+            view = np.array([distance_m[i] + shift[best, c, i, j], delta_rad[j], bearing_rad, 0.0, 0.0, 0.0])
+            starts.append((c, np.clip(view, *self.limits)))
             if len(starts) == _STARTS:
                 break
         return starts
-
-    def _at_best_bearing(self, frame: Reported, c: int, view: NDArray[np.float64]) -> _Fit:
-        """Return the view at the bearing that explains the targets best: what is at an edge of a zone has no slope."""
-        views = np.repeat(view[None], 2 * len(self._bearings_rad) - 1, axis=0)
-        views[:, VIEW_FIELDS.index("bearing_rad")] = np.linspace(
-            min(self._bearings_rad), max(self._bearings_rad), len(views)
-        )
-        return _Fit(self, frame, c, views[int(np.argmin(self._costs(frame, c, views)))])
 
     def _beside(self, frame: Reported, fits: Sequence[_Fit]) -> list[_Fit]:
         """Return fits that begin a little aside of the best one of every class: a step may end before a small hill."""
