@@ -11,7 +11,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -19,6 +19,7 @@ from phasemark import PhasemarkError, StorageError, UsageError, __version__
 from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
+from phasemark.data.commands.interruption import Interruption
 from phasemark.matcher.commands import (
     accuracy,
     bank_trials,
@@ -32,10 +33,6 @@ from phasemark.matcher.commands import (
     sweep,
     warm,
 )
-
-if TYPE_CHECKING:
-    from types import FrameType
-
 
 __all__ = ["app", "main"]
 _NO_VERIFY = "--no-verify"
@@ -162,33 +159,6 @@ def _open_closed_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))
 
 
-_MOST_WAITS = 30
-
-
-def _terminate(signum: int, frame: FrameType | None, waited: int = 0) -> None:
-    """Unwind the stack, so that temporary files are removed, and exit like a process that the signal ended.
-
-    An exception within an import would leave its lock taken, or a library would read it as a missing package: the
-    signal waits until imports are done, a tenth of a second at a time; in a module that hangs, three seconds.
-    """
-    if waited < _MOST_WAITS and _is_importing(frame) and hasattr(signal, "setitimer"):
-        signal.signal(signal.SIGALRM, lambda _, then: _terminate(signum, then, waited + 1))
-        signal.setitimer(signal.ITIMER_REAL, 0.1)
-        return
-    if signum == signal.SIGINT:
-        raise KeyboardInterrupt
-    raise SystemExit(128 + signum)
-
-
-def _is_importing(frame: FrameType | None) -> bool:
-    """Return True if an import is on the stack."""
-    while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
-            return True
-        frame = frame.f_back
-    return False
-
-
 def _run(arguments: list[str]) -> None:
     """Parse and run one command; typer's own errors become ours."""
     command = typer.main.get_command(app)
@@ -231,9 +201,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         of a pipe went away. SIGTERM ends the process with 143. Any other exception is a bug of ours: it passes, and
         Python prints its traceback and exits with 1.
     """
-    signal.signal(signal.SIGTERM, _terminate)
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # nobody has it ignored
-        signal.signal(signal.SIGINT, _terminate)
     _open_closed_streams()
     if arguments is None and _COMPLETION in os.environ:  # the shell asks what may follow
         app(prog_name="phasemark")
@@ -244,8 +211,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors="backslashreplace")  # a terminal without '×' or 'σ' is no reason to fail
     try:
         try:
-            with warnings_as_notes(), pipes_read_once():
+            with Interruption() as interruption, warnings_as_notes(), pipes_read_once():
                 _run(list(sys.argv[1:] if arguments is None else arguments))
+                interruption.raise_waiting()
         finally:
             sys.stdout.flush()
     except PhasemarkError as error:

@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,7 +67,7 @@ class Outcome(NamedTuple):
 
 
 @pytest.fixture
-def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Outcome]]:
+def run(capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
     """Run a command in this process; return its exit code, standard output and standard error."""
     from phasemark.cli import main  # not above: the environment is set before anything is imported
 
@@ -76,6 +76,4 @@ def run(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., Outcome]]:
         code = main([str(argument) for argument in arguments])
         return Outcome(code, *capsys.readouterr())
 
-    before = signal.getsignal(signal.SIGTERM)
-    yield call
-    signal.signal(signal.SIGTERM, before)
+    return call

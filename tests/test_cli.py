@@ -1,5 +1,6 @@
 """The frame of the command line: exit codes, one line for every mistake, output that other programs can read."""
 
+import ctypes
 import importlib
 import io
 import json
@@ -18,6 +19,7 @@ import pytest
 
 from phasemark import PhasemarkError, StorageError, __version__, cli
 from phasemark.data.commands import console
+from phasemark.data.commands.interruption import Interruption
 from phasemark.render import Sensor, preset, preset_names
 
 PHASEMARK = str(Path(sys.executable).with_name("phasemark"))
@@ -112,16 +114,47 @@ def test_a_signal_within_an_import_ends_the_program_after_it(tmp_path, monkeypat
         "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(0.2)\nis_whole = True\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    before = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGALRM)}
-    signal.signal(signal.SIGTERM, cli._terminate)
-    try:
-        with pytest.raises(SystemExit) as caught:
-            _import_and_wait("guarded")
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with pytest.raises(SystemExit) as caught, Interruption():
+        _import_and_wait("guarded")
     assert caught.value.code == 143
     assert sys.modules["guarded"].interrupted.is_whole
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("by", ["finaliser", "callback"])
+def test_a_signal_where_python_discards_exceptions_ends_the_program_all_the_same(number, code, by, capfd, monkeypatch):
+    """Compiled code calls functions whose exceptions go nowhere."""
+    monkeypatch.setattr("phasemark.data.commands.interruption._DEAF", ())  # of functions that are not listed there
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as caught, Interruption():
+        _signal_and_wait(number, by)
+    signal.signal(signal.SIGINT, before)
+    assert getattr(caught.value, "code", 130) == code
+    assert capfd.readouterr() == ("", "")
+
+
+def _signal_and_wait(number: int, by: str) -> None:
+    class Signals:
+        def __del__(self) -> None:
+            signal.raise_signal(number)
+
+    if by == "finaliser":
+        Signals()
+    else:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(number))()
+    time.sleep(5)
+
+
+def test_a_signal_that_waits_when_all_is_done_is_not_forgotten(tmp_path, run, monkeypatch):
+    (tmp_path / "signalled.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGTERM)\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr("phasemark.data.commands.interruption._TICK_S", 10.0)
+    monkeypatch.setattr(
+        "phasemark.data.commands.sensor.read_sensor", lambda name: importlib.import_module("signalled") and preset(name)
+    )
+    with pytest.raises(SystemExit, match="143"):
+        run("sensor", "show", "ideal")
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
 def _import_and_wait(module: str) -> None:

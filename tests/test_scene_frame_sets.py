@@ -6,7 +6,6 @@ import hashlib
 import importlib
 import json
 import math
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,8 +19,9 @@ import xarray
 from own_generators import WALL, at
 
 from phasemark import InputFileError, UsageError
-from phasemark.cli import _terminate, main
+from phasemark.cli import main
 from phasemark.data import build_frames, open_frames
+from phasemark.data.commands.interruption import Interruption
 from phasemark.data.export import export_frames
 from phasemark.data.files import write_checksum
 from phasemark.data.frames import FrameSet
@@ -409,13 +409,8 @@ def test_a_label_of_several_words_and_lines_is_one_word_of_a_comment(tmp_path: P
 
 
 def test_sigterm_within_a_generator_ends_the_program(tmp_path: Path) -> None:
-    before = signal.getsignal(signal.SIGTERM)
-    signal.signal(signal.SIGTERM, _terminate)
-    try:
-        with pytest.raises(SystemExit) as caught:
-            plan_of("is_terminated").generate(0)
-    finally:
-        signal.signal(signal.SIGTERM, before)
+    with pytest.raises(SystemExit) as caught, Interruption():
+        plan_of("is_terminated").generate(0)
     assert caught.value.code == 143
 
 
