@@ -101,6 +101,8 @@ class PartJob:
     maker = "phasemark.data.partial_outputs:job_of"
 
     def __init__(self, job: Job, part: int, parts: int) -> None:
+        if not 1 <= part <= parts:
+            raise UsageError(f"'part' must be (i, n) with 1 ≤ i ≤ n, got {(part, parts)}")
         self._job, self._part, self._parts = job, part, parts
         self._total = sum(job.items)
         self.start, self.stop = _shared(self._total, part, parts)

@@ -75,10 +75,16 @@ def pixel_mask(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bo
     Raises
     ------
     UsageError
-        A name is unknown.
+        A name is unknown, or an array is no mask of the sensor's pixels.
     """
     if not isinstance(pixels, str):
-        return np.asarray(pixels, np.bool_)
+        mask = np.asarray(pixels)
+        if mask.dtype != np.bool_ or mask.shape[-2:] != (sensor.rows, sensor.cols):
+            raise UsageError(
+                f"'pixels' must be all, lower or booleans of {sensor.rows} × {sensor.cols} pixels, got"
+                f" {mask.dtype} {mask.shape}"
+            )
+        return mask
     if pixels not in ("all", "lower"):
         raise UsageError(f"'pixels' must be all, lower or an array, got {pixels!r}")
     mask = np.ones((sensor.rows, sensor.cols), np.bool_)

@@ -14,12 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
+from phasemark import UsageError
 from phasemark.render.view import wrap_delta_difference_rad
 
 Law = Literal["student", "normal"]
@@ -66,6 +67,11 @@ def binomial_interval(successes: int, n: int, *, law: Law = "normal") -> Interva
     Interval
         NaN in [0, 1] where n is 0.
 
+    Raises
+    ------
+    UsageError
+        There are more successes than trials, or less than none; or the law is unknown.
+
     Examples
     --------
     >>> print(binomial_interval(0, 10))
@@ -73,6 +79,9 @@ def binomial_interval(successes: int, n: int, *, law: Law = "normal") -> Interva
     >>> print(binomial_interval(0, 10, law="student"))
     0.000 [0.000, 0.278]
     """
+    _check_law(law)
+    if not 0 <= successes <= n:
+        raise UsageError(f"'successes' must be between 0 and 'n' = {n}, got {successes}")
     if n == 0:
         return Interval(math.nan, 0.0, 1.0)
     k = int(successes)
@@ -137,7 +146,13 @@ def rms_interval(values: ArrayLike, *, law: Law = "student") -> Interval:
     return Interval(rms, rms * math.exp(-half), rms * math.exp(half))
 
 
+def _check_law(law: Law) -> None:
+    if law not in get_args(Law):
+        raise UsageError(f"'law' must be one of {', '.join(get_args(Law))}, got {law!r}")
+
+
 def _quantile(n: int, law: Law) -> float:
+    _check_law(law)
     z95 = 1.96
     return z95 if law == "normal" else float(special.stdtrit(n - 1, (1 + _LEVEL) / 2))
 
@@ -186,7 +201,14 @@ def within_ellipsoid(error: ArrayLike, covariance: ArrayLike, level: float = 0.9
     Returns
     -------
     (n,) bool
+
+    Raises
+    ------
+    UsageError
+        The level is no probability.
     """
+    if not 0 < level < 1:
+        raise UsageError(f"'level' must be in (0, 1), got {level!r}")
     e = np.asarray(error, np.float64)
     return np.asarray(nees(e, covariance) <= special.chdtri(e.shape[1], 1 - level))
 

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from phasemark import UsageError
 from phasemark.inputs.numbers import real_array
 from phasemark.render.png import figure_png
-from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -105,6 +105,9 @@ class Frames:
         tilt_rad: ArrayLike | None = None,
         by_frequency: Sequence[Frames] = (),
     ) -> None:
+        refuse_no_sensor(sensor)
+        if invalid_means not in ("missing", "no-return"):
+            raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
         given = ranges = real_array("range_m", np.ma.getdata(range_m))
         if ranges.ndim not in (2, 3, 4):
             raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")

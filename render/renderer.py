@@ -34,7 +34,7 @@ from phasemark.render.integral.slopes import STEP
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
-from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
 if TYPE_CHECKING:
@@ -106,10 +106,8 @@ class Renderer:
             raise UsageError(
                 f"'mesh' must be a mesh, got {type(mesh).__name__}: build_mesh makes one of a LandmarkSpec"
             )
-        if not hasattr(sensor, "harmonic_orders"):
-            raise UsageError(f"'sensor' must be a Sensor, got {type(sensor).__name__}: preset gives one by its name")
-        if not 0 < albedo <= 1:
-            raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
+        refuse_no_sensor(sensor)
+        _check_albedo(albedo)
         max_splits = 4
         if splits != int(splits) or not 1 <= splits <= max_splits:
             raise UsageError(f"'splits' must be a whole number from 1 to {max_splits}, got {splits!r}")
@@ -153,7 +151,13 @@ class Renderer:
         ----------
         albedo : float
             In (0, 1].
+
+        Raises
+        ------
+        UsageError
+            It is not.
         """
+        _check_albedo(albedo)
         other = self.seen_by(self.sensor)
         other.albedo = other._integral.albedo = float(albedo)
         return other
@@ -427,6 +431,7 @@ class Renderer:
         UsageError
             Naming the view.
         """
+        views.check_possible()
         self._check_lens_outside(views)
         behind = parameters_of_views(background, len(views))
         check_behind(behind, self.footprint, views)
@@ -532,6 +537,11 @@ class Renderer:
                 f"in view {near[0]} the lens is inside the landmark's bounding box (distance_m ="
                 f" {views.distance_m[near[0]]:g}): 'distance_m' must be above {least_m:.3g} at this 'delta_rad'"
             )
+
+
+def _check_albedo(albedo: float) -> None:
+    if not 0 < albedo <= 1:
+        raise UsageError(f"'albedo' must be in (0, 1], got {albedo!r}")
 
 
 def _restored(values: NDArray[Any], order: slice | NDArray[np.int64]) -> NDArray[Any]:

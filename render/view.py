@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -160,20 +161,7 @@ class Views:
                 raise
             except (TypeError, ValueError, OverflowError):
                 raise UsageError(f"'{name}' must be numbers, got {given!r}") from None
-        for name, value in zip(names, values, strict=True):
-            bad = value[~np.isfinite(value)]
-            if bad.size:
-                raise UsageError(f"'{name}' must be finite, got {bad.flat[0]}")
-        if values[0].size and values[0].min() <= 0:
-            raise UsageError(f"'distance_m' must be positive, got {values[0].min()}")
-        for name, value in (("distance_m", values[0]), ("height_m", values[3])):
-            if value.size and np.abs(value).max() > FARTHEST_M:
-                largest = value.flat[np.abs(value).argmax()]
-                raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m, got {largest:g}")
-        for name, value, most in (("pitch_rad", values[4], math.pi / 2), ("roll_rad", values[5], math.pi)):
-            if value.size and np.abs(value).max() > most:
-                largest = value.flat[np.abs(value).argmax()]
-                raise UsageError(f"'{name}' must be within ± {most:.5g} (± {math.degrees(most):g}°), got {largest:g}")
+        _check_values(values)
         try:
             arrays = np.broadcast_arrays(*values)
         except ValueError:
@@ -181,6 +169,16 @@ class Views:
             raise UsageError(f"the views' shapes do not broadcast: {shapes}") from None
         # copies: what broadcast_arrays returns warns when its flags are read, as numba does
         return cls(*(np.array(array, dtype=float, order="C").ravel() for array in arrays))
+
+    def check_possible(self) -> None:
+        """Refuse views that no camera has.
+
+        Raises
+        ------
+        UsageError
+            As for :meth:`broadcast`.
+        """
+        _check_values([getattr(self, name) for name in VIEW_FIELDS])
 
     def __len__(self) -> int:
         return len(self.distance_m)
@@ -361,3 +359,21 @@ class Footprint:
         away = np.stack([np.cos(delta_rad), np.sin(delta_rad)], axis=-1)
         farthest = np.maximum(away * self.low_m, away * self.high_m).sum(axis=-1)
         return np.asarray(np.minimum(farthest, self.radius_m))
+
+
+def _check_values(values: Sequence[NDArray[np.float64]]) -> None:
+    """Refuse views that no camera has, given field by field."""
+    for name, value in zip(VIEW_FIELDS, values, strict=True):
+        bad = value[~np.isfinite(value)]
+        if bad.size:
+            raise UsageError(f"'{name}' must be finite, got {bad.flat[0]}")
+    if values[0].size and values[0].min() <= 0:
+        raise UsageError(f"'distance_m' must be positive, got {values[0].min()}")
+    for name, value in (("distance_m", values[0]), ("height_m", values[3])):
+        if value.size and np.abs(value).max() > FARTHEST_M:
+            largest = value.flat[np.abs(value).argmax()]
+            raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m, got {largest:g}")
+    for name, value, most in (("pitch_rad", values[4], math.pi / 2), ("roll_rad", values[5], math.pi)):
+        if value.size and np.abs(value).max() > most:
+            largest = value.flat[np.abs(value).argmax()]
+            raise UsageError(f"'{name}' must be within ± {most:.5g} (± {math.degrees(most):g}°), got {largest:g}")

@@ -5,6 +5,7 @@ import math
 import pickle
 import pydoc
 from dataclasses import fields
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,15 @@ from test_sweep_tables import linear_sweep
 
 import phasemark
 from phasemark import UsageError
-from phasemark.data import BankPlan, build_bank
+from phasemark.data import BankPlan, build_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.diagnosis.diagnose import Diagnosis
-from phasemark.render import Renderer, Views, capture, preset
+from phasemark.render import Frames, Renderer, Views, capture, preset
+from phasemark.render.direct import HistogramRenderer
 
 SENSOR = preset("pmd-16x16")
+NAME: Any = "pmd-16x16"
 
 
 @pytest.fixture(scope="module")
@@ -59,12 +62,42 @@ def test_a_specification_is_no_mesh():
         (Matcher, ("bank.h5",), "'bank' must be a bank, got str: open_bank opens a file"),
         (Views, ([1, 2], [0.1], [0], [0]), r"views need one array of n values each, got .* \(2,\), .* \(1,\)"),
         (Views, (1.0, 0.1, 0.0, 0.0), r"views need one array of n values each, got distance_m \(\)"),
+        (HistogramRenderer, (None, "vl53l5cx-8x8"), "'sensor' must be a Sensor, got str"),
+        (partial(Frames, sensor=NAME), (np.ones((16, 16)),), "'sensor' must be a Sensor, got str"),
+        (partial(read_frames, sensor=NAME), ("frames.npz",), "'sensor' must be a Sensor, got str"),
         (build_mesh, ("cone",), r"'spec' must be a LandmarkSpec, got str: catalog\(\)\['cone'\] is one"),
     ],
 )
 def test_a_name_or_a_list_in_place_of_what_it_stands_for_is_answered_in_words(function: Any, arguments, message):
     with pytest.raises(UsageError, match=message):
         function(*arguments)
+
+
+@pytest.mark.parametrize("on", ["range", "reported", None])
+def test_a_bound_is_of_ranges_or_phasors(renderer, on: Any):
+    with pytest.raises(UsageError, match="'on' must be 'ranges' or 'phasors', got"):
+        cramer_rao(renderer, Views.broadcast(1.0), on=on)
+
+
+@pytest.mark.parametrize("pixels", [5, np.ones((4, 4), np.bool_), np.ones((16, 16))])
+def test_pixels_are_named_or_a_mask_of_the_sensor(renderer, pixels: Any):
+    with pytest.raises(UsageError, match="'pixels' must be all, lower or booleans of 16 × 16 pixels, got"):
+        cramer_rao(renderer, Views.broadcast(1.0), pixels=pixels)
+
+
+@pytest.mark.parametrize(("distance_m", "message"), [(-1.0, "must be positive, got -1"), (math.nan, "must be finite")])
+def test_views_that_no_camera_has_are_not_rendered(renderer, distance_m, message):
+    views = Views(np.array([1.0, distance_m]), *np.zeros((3, 2)))
+    for render in (renderer.render_views, HistogramRenderer(None, preset("vl53l5cx-8x8")).render_views):
+        with pytest.raises(UsageError, match=f"'distance_m' {message}"):
+            render(views)
+
+
+@pytest.mark.parametrize("albedo", [80, -1, math.nan])
+def test_an_albedo_is_a_share(renderer, albedo):
+    for one in (renderer, HistogramRenderer(None, preset("vl53l5cx-8x8"))):
+        with pytest.raises(UsageError, match=r"'albedo' must be in \(0, 1\], got"):
+            one.with_albedo(albedo)
 
 
 @pytest.mark.parametrize(("options", "message"), [({"robust": "no"}, "True or False"), ({"workers": 0}, "at least 1")])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import xarray
 from programs.system_calls import in_fork
+from scipy import stats
 
 from phasemark import InputFileError, OutputExistsError, UsageError
 from phasemark.data import BankPlan, FramePlan, build_bank, build_frames, open_frames, read_frames
@@ -79,6 +80,8 @@ def sha256(path):
         ({"views": 1, "splits": {"a b": 1.0}}, "each key of 'splits' must begin with a letter or digit .*, got 'a b'"),
         ({"views": 1, "delta_deg": {"gauss": [0, 1]}}, "unknown key 'gauss'"),
         ({"views": 1, "delta_deg": {"fixed": 0, "within": [0, 1]}}, "'within' cuts the tails of 'normal'"),
+        ({"views": 1, "delta_deg": {"normal": [1, 0.1], "within": [50, 60]}}, "no draw of 'normal'"),
+        ({"views": 1, "delta_deg": {"normal": [1, 0], "within": [1.1, 1.3]}}, "no draw of 'normal'"),
     ],
 )
 def test_a_plan_that_cannot_be_is_refused_by_its_key(fields, message):
@@ -394,6 +397,33 @@ def test_verify_renders_a_bank_again(tmp_path):
     write_checksum(path, force=True)
     with pytest.raises(InputFileError, match="'phasor' of item"):
         verify_bank(path, sample=100)
+
+
+@pytest.mark.parametrize("within", [(-9.0, -8.0), (-0.5, 0.7), (0.9, 3.0), (7.0, 9.0), (20.0, 30.0)])
+def test_a_normal_with_cut_tails_is_truncated_at_either_end(within):
+    share = np.linspace(0.001, 0.999, 999)
+    drawn = Distribution(normal=(1, 0.1), within=tuple(1 + 0.1 * bound for bound in within)).values(share)
+    np.testing.assert_allclose(drawn, stats.truncnorm.ppf(share, *within, 1, 0.1), rtol=1e-12)
+
+
+def test_a_part_is_one_of_how_many(tmp_path):
+    for part in ((3, 2), (0, 2), (1, 0)):
+        with pytest.raises(UsageError, match=r"'part' must be \(i, n\) with 1 ≤ i ≤ n, got"):
+            build_part(PLAN, part, tmp_path / "part.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_subset_is_of_numbers_a_mask_or_a_split(frames):
+    chosen = np.arange(len(frames)) % 3 == 0
+    assert frames.subset(chosen).numbers.tolist() == np.flatnonzero(chosen).tolist()
+    assert len(frames.subset([])) == 0
+    for wrong, message in (
+        (chosen[1:], "must be whole numbers or a mask of"),
+        ([0.5], "must be whole numbers or a mask of"),
+        ([0, len(frames)], f"there is no frame {len(frames)}"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            frames.subset(wrong)
 
 
 def test_a_distribution_knows_its_bounds():

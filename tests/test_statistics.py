@@ -1,6 +1,7 @@
 """Errors of a view, their statistics, and the inverse of information: small cases that are known in closed form."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from phasemark.matcher.statistics import (
     mean_interval,
     rms_interval,
     view_errors,
+    within_ellipsoid,
 )
 from phasemark.render import Views, preset
 from phasemark.render.view import delta_period_rad, wrap_delta_difference_rad, wrap_delta_rad
@@ -120,3 +122,16 @@ def test_the_lower_half_begins_at_the_middle_line(rows):
     assert mask[4:].all()
     with pytest.raises(UsageError, match="'pixels' must be all, lower or an array"):
         pixel_mask("upper", sensor)
+
+
+def test_shares_and_levels_are_not_percent_and_not_swapped():
+    wilson: Any = "wilson"
+    for call, message in (
+        (lambda: binomial_interval(10, 3), "'successes' must be between 0 and 'n' = 3, got 10"),
+        (lambda: binomial_interval(-1, 3), "'successes' must be between 0 and 'n' = 3, got -1"),
+        (lambda: binomial_interval(1, 3, law=wilson), "'law' must be one of student, normal, got 'wilson'"),
+        (lambda: mean_interval([1.0, 2.0], law=wilson), "'law' must be one of student, normal"),
+        (lambda: within_ellipsoid(np.zeros((1, 2)), np.eye(2)[None], 95), r"'level' must be in \(0, 1\), got 95"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            call()

@@ -1,16 +1,22 @@
 """Files are whole or not there."""
 
 import os
+import resource
 import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from builders import run_program
+from programs.system_calls import in_fork
 
-from phasemark import InputFileError, OutputExistsError, UsageError
+from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.files import renames, write_atomically, write_checksum
+from phasemark.data.measured import simulate_recording, write_recording
 from phasemark.inputs import read_checksum, verify_checksum
+from phasemark.landmarks import build_mesh, catalog
+from phasemark.render import Views, preset
 
 
 def names(folder: Path) -> list[str]:
@@ -197,3 +203,22 @@ def test_a_rename_that_replaces_nothing_refuses_an_existing_name(tmp_path, monke
 def test_a_file_ended_at_any_call_to_the_system_is_the_old_or_the_new_one(tmp_path, action):
     printed = run_program("file_crash_points", tmp_path, action)
     assert int(printed) > 15
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", ".h5"])
+def test_a_recording_that_does_not_fit_leaves_the_old_one(tmp_path, suffix):
+    cone = build_mesh(catalog()["cone"])
+    taken = simulate_recording(cone, "cone", preset("pmd-16x16"), Views.broadcast(np.full(40, 1.0)), seed=1)
+    path = tmp_path / f"recording{suffix}"
+    path.write_text("old")
+
+    def written_with_little_space() -> int:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (6000, 6000))
+        try:
+            write_recording(taken, path, force=True)
+        except StorageError as error:
+            return error.exit_code
+        return 0
+
+    assert in_fork(written_with_little_space) == 5
+    assert {file.name: file.read_text() for file in tmp_path.iterdir()} == {path.name: "old"}

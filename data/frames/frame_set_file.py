@@ -390,10 +390,26 @@ class FrameSet(StoredScene):
         return np.flatnonzero(of_split[self.view_index])
 
     def subset(
-        self, frames: str | Sequence[int] | NDArray[np.integer], transform: Callable[[Sample], Any] | None = None
+        self,
+        frames: str | Sequence[int] | NDArray[np.integer | np.bool_],
+        transform: Callable[[Sample], Any] | None = None,
     ) -> FrameSubset:
-        """Return some frames, or a split by its name, as a map-style data set."""
-        return FrameSubset(self, self.split(frames) if isinstance(frames, str) else np.asarray(frames), transform)
+        """Return some frames by number or mask, or a split by its name, as a map-style data set.
+
+        Raises
+        ------
+        UsageError
+            There is no such split or frame, or a mask is not of all frames.
+        """
+        numbers = self.split(frames) if isinstance(frames, str) else np.asarray(frames)
+        if numbers.dtype == np.bool_ and numbers.shape == (len(self),):
+            numbers = np.flatnonzero(numbers)
+        if numbers.size and (numbers.dtype.kind not in "iu" or numbers.ndim != 1):
+            raise UsageError(f"'frames' must be whole numbers or a mask of {len(self)} frames, got {frames!r}")
+        beyond = numbers[(numbers < -len(self)) | (numbers >= len(self))]
+        if beyond.size:
+            raise UsageError(f"{self.path} has {len(self)} frames, from 0: there is no frame {beyond[0]}")
+        return FrameSubset(self, numbers, transform)
 
     def __repr__(self) -> str:
         """Return one line with the content of the frame set, open or closed."""

@@ -37,6 +37,7 @@ from phasemark.data.measured.recording import (
 from phasemark.inputs import opened
 from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
+from phasemark.render.sensor.sensor import refuse_no_sensor
 from phasemark.render.unwrapped_frames import unwrap_frames
 
 Unit = Literal["m", "cm", "mm"]
@@ -154,6 +155,7 @@ def read_frames(
         raise UsageError(f"'rotate' must be 0, 90, 180 or 270, got {rotate!r}")
     if invalid_means not in ("missing", "no-return"):
         raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
+    refuse_no_sensor(sensor)
     raw = _read(path, shape_before(sensor, rotate), untrusted, topic, sensor, board)
     if board is not None and raw.valid_status is None:
         raise UsageError(f"{path}: board=… goes with text that a board printed: leave it out")

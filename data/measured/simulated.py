@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError, __version__
-from phasemark.data.files.atomic_write import replacing, write_atomically
+from phasemark.data.files.atomic_write import write_atomically
 from phasemark.data.files.csv_cell import csv_text
 from phasemark.data.measured.recording import npz_bytes
 from phasemark.data.seeds import stream
@@ -180,12 +181,13 @@ def write_recording(
     if suffix == ".npz":
         content = npz_bytes({**arrays, "unit": unit, "quantity": quantity, "simulated": told})
         return write_atomically(path, content, force=force)
-    with replacing(path, force=force) as temporary, h5py.File(temporary, "w") as file:
+    buffer = io.BytesIO()  # HDF5 can end the program where a disk is full
+    with h5py.File(buffer, "w") as file:
         file.attrs["simulated"] = told
         for name, values in arrays.items():
             file[name] = str(values) if values.dtype.kind == "U" else values
         file["range"].attrs.update({"units": unit, "quantity": quantity})
-    return path
+    return write_atomically(path, buffer.getvalue(), force=force)
 
 
 def recording_format(path: Path) -> str:

@@ -74,6 +74,8 @@ class Distribution(PlanModel):
             raise UsageError(f"the standard deviation of 'normal' must not be negative, got {self.normal[1]}")
         if self.within is not None and self.normal is None:
             raise UsageError("'within' cuts the tails of 'normal': it stands for nothing without it")
+        if self.within is not None and self.normal is not None and not _share_within(self.within, *self.normal) > 0:
+            raise UsageError(f"no draw of 'normal' = {list(self.normal)} lies 'within' = {list(self.within)}")
         return self
 
     @property
@@ -106,8 +108,21 @@ class Distribution(PlanModel):
         mean, std = self.normal
         if self.within is None or std == 0:
             return np.asarray(mean + std * special.ndtri(share))
-        low, high = (special.ndtr((bound - mean) / std) for bound in self.within)
-        return np.clip(mean + std * special.ndtri(low + (high - low) * share), *self.within)
+        low, high = ((bound - mean) / std for bound in self.within)
+        if low > 0:  # shares above the mean are rounded to 1: the other tail is exact
+            low, high, share, std = -high, -low, 1 - share, -std
+        below = special.ndtr(low)
+        return np.clip(mean + std * special.ndtri(below + (special.ndtr(high) - below) * share), *self.within)
+
+
+def _share_within(within: tuple[float, float], mean: float, std: float) -> float:
+    """Return how much of a normal is left within its limits."""
+    if std == 0:
+        return float(within[0] <= mean <= within[1])
+    if within[0] == within[1]:  # all draws are clipped to one value
+        return 1.0
+    low, high = ((bound - mean) / std for bound in within)
+    return float(special.ndtr(-low) - special.ndtr(-high) if low > 0 else special.ndtr(high) - special.ndtr(low))
 
 
 def _to_distribution(value: Any, info: ValidationInfo) -> Any:

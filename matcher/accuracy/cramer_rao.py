@@ -165,6 +165,10 @@ def cramer_rao(
         if "declared" in check_systematic(systematic):
             declared = np.broadcast_to(declared_covariance(renderer.sensor, free), information.shape)
         return Bound(tuple(free), information, everywhere, declared)
+    if on not in ("ranges", "phasors"):
+        raise UsageError(
+            f"'on' must be 'ranges' or 'phasors', got {on!r}: a HistogramRenderer has the bound of histograms"
+        )
     nuisances = (("albedo",) if on == "phasors" else ()) if nuisances is None else tuple(nuisances)
     for name in nuisances:
         if name not in NUISANCES:

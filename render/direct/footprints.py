@@ -17,7 +17,7 @@ from phasemark import UsageError
 from phasemark.render.integral.arguments import Camera
 from phasemark.render.kernel import inner, kernel
 from phasemark.render.sensor.histogram_fields import Histogram
-from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
 
 _REACH = 2.5
 """The border's profile ends this many `blur` outside a zone: 2e-4 of its height."""
@@ -65,8 +65,9 @@ def histogram_of(sensor: Sensor) -> Histogram:
     Raises
     ------
     UsageError
-        The sensor has none.
+        The sensor has none, or it is none.
     """
+    refuse_no_sensor(sensor)
     if sensor.histogram is None:
         raise UsageError("the sensor has no [histogram] table: its histograms are not described")
     return sensor.histogram

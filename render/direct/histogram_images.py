@@ -123,8 +123,14 @@ class HistogramRenderer:
         ----------
         albedo : float
             In (0, 1].
+
+        Raises
+        ------
+        UsageError
+            It is not.
         """
         other = copy.copy(self)
+        other._exact = self._exact.with_albedo(albedo)
         other.albedo = float(albedo)
         return other
 

@@ -26,7 +26,7 @@ from phasemark.render.rigid import composed, product, rigid_transforms
 from phasemark.render.scene.assembly import Assembly
 from phasemark.render.scene.scene import Scene
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
-from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
 from phasemark.render.threads import mapped
 
 _TOUCH_M = 1e-9
@@ -87,6 +87,7 @@ class SceneRenderer:
     ) -> None:
         if not isinstance(scene, Scene):
             raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
+        refuse_no_sensor(sensor)
         self.scene = scene
         self.sensor = sensor
         self._harmonics = tuple(sensor.harmonic_orders if harmonics is None else harmonics)

@@ -480,6 +480,18 @@ class Sensor(SensorQuantities):
 
 
 @lru_cache(maxsize=32)
+def refuse_no_sensor(sensor: object) -> None:
+    """Refuse what stands in the place of a sensor, most often the name of a preset.
+
+    Raises
+    ------
+    UsageError
+        It has no fields of a sensor.
+    """
+    if not hasattr(sensor, "harmonic_orders"):
+        raise UsageError(f"'sensor' must be a Sensor, got {type(sensor).__name__}: preset gives one by its name")
+
+
 def _cameras_of_one_frequency(sensor: Sensor) -> tuple[Sensor, ...]:
     # the guard is about the wrap of the unwrapped range, which no frequency has alone
     same = {"phase_interval_s": sensor.phase_image_interval_s, "wrap_guard_m": 0.0}
