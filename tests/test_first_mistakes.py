@@ -14,10 +14,12 @@ from test_sweep_tables import linear_sweep
 
 import phasemark
 from phasemark import UsageError
-from phasemark.data import BankPlan, build_bank, read_frames
+from phasemark.data import BankPlan, build_bank, build_frames, read_frames
+from phasemark.data.export import export_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.diagnosis.diagnose import Diagnosis
+from phasemark.matcher.sweep import run_sweep
 from phasemark.render import Frames, Renderer, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer
 
@@ -71,6 +73,23 @@ def test_a_specification_is_no_mesh():
 def test_a_name_or_a_list_in_place_of_what_it_stands_for_is_answered_in_words(function: Any, arguments, message):
     with pytest.raises(UsageError, match=message):
         function(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (
+            lambda: cramer_rao(Renderer(None, SENSOR), NAME),
+            "'views' must be Views, got str: Views.broadcast makes them",
+        ),
+        (lambda: build_frames(NAME, "frames.h5"), "'plan' must be a FramePlan or a SceneFramesPlan, got 'pmd-16x16'"),
+        (lambda: export_frames(NAME, "frames.csv", "csv"), "'frames' must be a frame set, got str: open_frames opens"),
+        (lambda: run_sweep(NAME, "folder"), "'plan' must be a SweepPlan, got str"),
+    ],
+)
+def test_a_name_in_place_of_a_plan_or_a_set_is_answered_in_words(call, message):
+    with pytest.raises(UsageError, match=message):
+        call()
 
 
 @pytest.mark.parametrize("on", ["range", "reported", None])

@@ -189,12 +189,16 @@ def test_a_shard_is_written_i_of_n(text):
         parse_part(text)
 
 
-def test_resuming_a_finished_set_changes_nothing_and_of_another_plan_is_refused(frames_file):
+def test_resuming_a_finished_set_changes_nothing_and_of_another_plan_is_refused(frames_file, tmp_path):
     before = sha256(frames_file)
     build_frames(PLAN, frames_file, resume=True).close()
     assert sha256(frames_file) == before
     with pytest.raises(OutputExistsError, match=r"plan\.seed: 7 → 8"):
         build_frames(PLAN.model_copy(update={"seed": 8}), frames_file, resume=True)
+    for n_views in (3, 2):
+        plan = PLAN.model_copy(update={"views": n_views})
+        with build_frames(plan, tmp_path / "frames.h5", resume=True, force=True) as built:
+            assert len(built) == n_views * PLAN.frames_per_view
 
 
 @pytest.mark.parametrize(

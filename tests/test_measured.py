@@ -233,6 +233,12 @@ def test_zeros_are_no_readings_and_say_nothing_of_the_unit(tmp_path):
     assert frames.valid[0, 0].tolist() == [[False, False, False], [False, False, True]]
 
 
+def test_a_mask_is_no_range(tmp_path):
+    np.savez(tmp_path / "mask.npz", range=np.ones((1, SMALL.rows, SMALL.cols), np.bool_))
+    with pytest.raises(InputFileError, match="'range' must hold real numbers, got bool"):
+        read_frames(tmp_path / "mask.npz", sensor=SMALL, **STATED)
+
+
 def test_nothing_but_zeros_is_an_error(tmp_path):
     with pytest.raises(InputFileError, match="every range is 0, which stands for no reading"):
         read_frames(csv_file(tmp_path, "0,0,0,0,0,0\n"), sensor=SMALL, **STATED)
@@ -255,6 +261,20 @@ def test_the_error_names_the_units_in_which_every_range_would_be_possible(tmp_pa
     with pytest.raises(InputFileError, match=r"[56] of 6 ranges") as caught:
         read_frames(csv_file(tmp_path, text), sensor=sensor, unit=unit, quantity="range")
     assert str(caught.value).endswith("is unit=… right?" + (f" All would fit with {fitting}" if fitting else ""))
+
+
+@pytest.mark.parametrize(
+    ("unit", "text", "fitting"),
+    [
+        ("mm", "0.59,0.7,0.8,0.9,1,1.693\n", "unit=m (multiplying by 1000)"),
+        ("mm", "0.59,0.7,0,0.9,0.7,0.3\n", ""),
+        ("cm", "0.59,0.7,0.8,0.9,0.7,0.3\n", "unit=m (multiplying by 100)"),
+    ],
+)
+def test_ranges_that_no_lens_is_as_near_to_are_an_error_of_the_unit(tmp_path, unit, text, fitting):
+    with pytest.raises(InputFileError, match=r"every range is below 0.01 m; is unit=… right\?") as caught:
+        read_frames(csv_file(tmp_path, text), sensor=DIRECT, unit=unit, quantity="range")
+    assert str(caught.value).endswith(fitting)
 
 
 def test_a_direct_sensor_measures_little_beyond_its_largest_range(tmp_path):

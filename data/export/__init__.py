@@ -95,6 +95,8 @@ def export_frames(
     OutputExistsError, StorageError
         As :func:`phasemark.data.files.write_atomically`.
     """
+    if not isinstance(frames, FrameSet | SceneFrameSet):
+        raise UsageError(f"'frames' must be a frame set, got {type(frames).__name__}: open_frames opens a file")
     if to not in EXPORTS:
         raise UsageError(f"to=… must be one of {', '.join(EXPORTS)}, got '{to}'")
     write, is_folder, quantities = EXPORTS[to]

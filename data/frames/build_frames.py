@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ def frames_job(plan: FramePlan | SceneFramesPlan, stored_mesh: StoredMesh | None
 
 
 def build_frames(
-    plan: FramePlan | SceneFramesPlan,
+    plan: FramePlan | SceneFramesPlan | Mapping[str, Any],
     path: str | os.PathLike[str],
     *,
     force: bool = False,
@@ -61,8 +61,8 @@ def build_frames(
 
     Parameters
     ----------
-    plan : FramePlan or SceneFramesPlan
-        Plan of the frame set; the generator of scenes that it names is run.
+    plan : FramePlan, SceneFramesPlan or mapping
+        Plan of the frame set, or the fields of a FramePlan by name; the generator of scenes that it names is run.
     path : path-like
         The file to write; ``FILE.sha256`` goes beside it.
     force, resume, workers, scheduler
@@ -88,6 +88,10 @@ def build_frames(
     StorageError
         The disk is full or fails.
     """
+    if isinstance(plan, Mapping):
+        plan = FramePlan(**plan)
+    if not isinstance(plan, FramePlan | SceneFramesPlan):
+        raise UsageError(f"'plan' must be a FramePlan or a SceneFramesPlan, got {plan!r}")
     inputs = named_files(plan.model_dump())
     refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
     job = frames_job(plan)

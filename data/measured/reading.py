@@ -44,6 +44,8 @@ Unit = Literal["m", "cm", "mm"]
 RangeOrZ = Literal["range", "z"]
 InvalidMeans = Literal["missing", "no-return"]
 
+_NEAREST_M = 0.01
+"""No sensor reads less in all pixels."""
 METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
@@ -287,6 +289,9 @@ def _impossible(
     if valid.any() and empty.sum() == valid.sum():
         raise InputFileError(f"{path}: every range is 0, which stands for no reading")
     limit_m, reason = _range_limit(sensor)
+    if valid.any() and (np.abs(range_m[valid]) < _NEAREST_M).all():
+        fitting = _fitting_units(range_m[valid & ~empty], limit_m, unit)
+        raise InputFileError(f"{path}: every range is below {_NEAREST_M:g} m; is unit=… right?{fitting}")
     wrong = valid & ~empty & ~((range_m > 0) & (range_m < limit_m))
     count, of = int(wrong.sum()), int((valid & ~empty).sum())
     if count:
@@ -303,13 +308,13 @@ def _impossible(
 
 
 def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -> str:
-    """Return a sentence that names the smaller units in which all readings would be possible, if there are any."""
-    per_unit = METRES_PER_UNIT[unit]
-    factors = {name: per_unit / metres for name, metres in METRES_PER_UNIT.items() if metres < per_unit}
+    """Return a sentence that names the other units in which all readings would be possible, if there are any."""
+    factors = {name: metres / METRES_PER_UNIT[unit] for name, metres in METRES_PER_UNIT.items() if name != unit}
+    usual_m, least_m, most_m = np.median(readings_m), readings_m.min(), readings_m.max()
     fitting = [
-        f"unit={name} (dividing by {factor:g})"
+        f"unit={name} ({f'dividing by {1 / factor:g}' if factor < 1 else f'multiplying by {factor:g}'})"
         for name, factor in factors.items()
-        if (readings_m > 0).all() and (readings_m < limit_m * factor).all()
+        if least_m > 0 and most_m * factor < limit_m and usual_m * factor > _NEAREST_M
     ]
     return f" All would fit with {' or '.join(fitting)}" if fitting else ""
 
@@ -355,7 +360,7 @@ def _shaped(raw: Recording, sensor: Sensor, shape: tuple[int, int], path: Path) 
     arrays = {}
     for name, values in given.items():
         own, axes, what = layers.get(name, ((), "", ""))
-        if values.dtype.kind not in ("fiu" if own else "fiub"):
+        if values.dtype.kind not in ("fiu" if own or name in _NUMBERS else "fiub"):
             raise InputFileError(f"{path}: '{name}' must hold real numbers, got {values.dtype}")
         if not values.size:
             raise InputFileError(f"{path}: '{name}' holds no frames")

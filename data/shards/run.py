@@ -8,7 +8,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
-from phasemark import UsageError
+from phasemark import OutputExistsError, UsageError
 from phasemark.data.files.atomic_write import followed, refuse_unwritable
 from phasemark.data.files.same_file import refuse_inputs
 from phasemark.data.progress import Progress
@@ -82,8 +82,13 @@ def produce(
     path = Path(path)
     begun = manifest_path(followed(path)).exists()
     if resume and not begun and path.is_file():
-        refuse_difference(path, finished(path), job.identity())
-        return path
+        try:
+            refuse_difference(path, finished(path), job.identity())
+        except OutputExistsError:
+            if not force:
+                raise
+        else:
+            return path
     maker = open_maker(scheduler, job)
     with nullcontext() if maker is None else closing(maker):
         return build(

@@ -144,6 +144,8 @@ def cramer_rao(
     >>> [round(float(bound.std(name)[0]), 5) for name in bound.free]
     [0.00036, 0.00531]
     """
+    if not isinstance(views, Views):
+        raise UsageError(f"'views' must be Views, got {type(views).__name__}: Views.broadcast makes them of numbers")
     counted = np.asarray(n_frames, np.float64)
     if not np.all(counted > 0 if counted.ndim == 0 else counted >= 0):
         raise UsageError(f"'n_frames' must be at least 1, got {counted.min():g}")

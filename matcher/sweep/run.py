@@ -78,6 +78,8 @@ def run_sweep(
     StorageError
         The disk is full or fails.
     """
+    if not isinstance(plan, SweepPlan):
+        raise UsageError(f"'plan' must be a SweepPlan, got {type(plan).__name__}")
     plan = plan.resolve()
     for method in plan.methods:
         if method.is_program:
