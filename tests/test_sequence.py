@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from phasemark import UsageError
 from phasemark.matcher import Match
 from phasemark.matcher.match import Candidate
 from phasemark.matcher.sequence import FreeMotion, PoseEstimator, PoseFilter, Reading, Sighting, Standing
@@ -219,3 +220,18 @@ def test_a_delay_against_the_gyro_is_learnt_while_the_robot_turns_to_and_fro():
             errors.append(0.0 if found.pose is None else found.pose[2] - heading(now))
         off[std_s] = math.sqrt(np.mean(np.square(errors[75:])))
     assert off[0.03] < 0.4 * off[0.0]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: FreeMotion(speed_std=-1.0), "'speed_std' must not be negative, got -1"),
+        (lambda: FreeMotion(turn_walk=math.nan), "'turn_walk' must not be negative, got nan"),
+        (lambda: PoseEstimator(Standing(), FreeMotion(), gate=99.99), r"'gate' must be in \(0, 1\), got 99.99"),
+        (lambda: PoseEstimator(Standing(), FreeMotion(), tolerance_rad=math.nan), "'tolerance_rad' must be positive"),
+        (lambda: PoseEstimator(Standing(), FreeMotion(), jitter_s=-0.1), "'jitter_s' must not be negative, got -0.1"),
+    ],
+)
+def test_an_estimator_that_could_not_judge_is_refused(call: Any, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        call()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.data.plans.bank_plan import PlanModel
 from phasemark.matcher.position.landmark_map import Std
 from phasemark.matcher.sequence.planar import rotation
@@ -151,6 +152,11 @@ class FreeMotion:
         By how much it changes: rad/s per √s.
     gyro_noise : float
         Angle random walk of the gyro: rad per √s.
+
+    Raises
+    ------
+    UsageError
+        One of them is negative or no number.
     """
 
     speed_std: float = 0.5
@@ -158,6 +164,11 @@ class FreeMotion:
     turn_std: float = 1.0
     turn_walk: float = 2.0
     gyro_noise: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < math.inf:
+                raise UsageError(f"'{name}' must not be negative, got {value!r}")
 
     def start(self, pose_covariance: _Floats) -> _Floats:
         """Return the covariance of the whole state at the start, (6, 6)."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from phasemark import UsageError
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.sequence.odometry import Reading
 from phasemark.matcher.sequence.pose_filter import POSE, Motion, PoseFilter, Sighting
@@ -100,6 +101,11 @@ class PoseEstimator:
     smooths : bool
         Whether every step is kept, so that poses can be smoothed at the end: memory grows with the time.
 
+    Raises
+    ------
+    UsageError
+        The gate is no probability, a tolerance is not positive, or a time is negative.
+
     Examples
     --------
     >>> import numpy as np
@@ -128,6 +134,15 @@ class PoseEstimator:
         jitter_s: float = 0.0,
         smooths: bool = False,
     ) -> None:
+        if not 0 < gate < 1:
+            raise UsageError(f"'gate' must be in (0, 1), got {gate!r}")
+        for name, value in {"tolerance_m": tolerance_m, "tolerance_rad": tolerance_rad}.items():
+            if not value > 0:
+                raise UsageError(f"'{name}' must be positive, got {value!r}")
+        times = {"lost_after_s": lost_after_s, "delay_std_s": delay_std_s, "jitter_s": jitter_s}
+        for name, value in times.items():
+            if not value >= 0:
+                raise UsageError(f"'{name}' must not be negative, got {value!r}")
         self.standing = standing
         self._motion, self._gate, self._lost_after_s = motion, gate, lost_after_s
         self._tolerance, self._jitter_s, self._delay_std_s = (tolerance_m, tolerance_rad), jitter_s, delay_std_s
