@@ -158,7 +158,9 @@ def test_a_wrong_plan_is_one_line_with_file_key_value_and_remedy(tmp_path, text,
         ({"meshes": [{**PART, "name": "none"}]}, "'none' stands for no landmark"),
         ({"sensor": "kinect"}, "unknown sensor 'kinect'"),
         ({"sensor_overrides": {"contrast": 2}}, "'contrast' must be"),
-        ({"sensor_overrides": {"colour": 2}}, "unknown key 'colour'"),
+        ({"sensor_overrides": {"colour": 2}}, "'sensor_overrides': unknown key 'colour'"),
+        ({"region": [0, 1, 2]}, r"'region' must be whole, landmark or \[first row, .*\], got \[0, 1, 2\]"),
+        ({"region": [-1, 4, 0, 4]}, r"'region' must be whole, landmark or \[first row, .*\], got \[-1, 4, 0, 4\]"),
     ],
 )
 def test_what_does_not_exist_is_named(fields, reason):

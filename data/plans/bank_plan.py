@@ -23,7 +23,9 @@ from pydantic import (
     SerializerFunctionWrapHandler,
     ValidationError,
     ValidationInfo,
+    ValidatorFunctionWrapHandler,
     WithJsonSchema,
+    WrapValidator,
     model_serializer,
     model_validator,
 )
@@ -71,6 +73,15 @@ def _positive(values: tuple[float, ...], info: ValidationInfo) -> tuple[float, .
     if values[-1] > FARTHEST_M:
         raise UsageError(f"'{info.field_name}' must be at most {FARTHEST_M:g} m throughout, got {values[-1]!r}")
     return values
+
+
+def _named_or_edges(value: Any, checked: ValidatorFunctionWrapHandler) -> Any:
+    try:
+        return checked(value)
+    except ValidationError:
+        raise UsageError(
+            "'region' must be whole, landmark or [first row, stop row, first column, stop column], got " + repr(value)
+        ) from None
 
 
 _GRID_SCHEMA = {
@@ -330,7 +341,9 @@ class BankPlan(ScenePlan):
     layout: Literal["factored", "full"] = "factored"
     albedo: _Albedo | None = None
     harmonics: tuple[Annotated[int, Field(ge=2, le=99)], ...] = ()
-    region: Literal["whole", "landmark"] | tuple[_Edge, _Edge, _Edge, _Edge] = "whole"
+    region: Annotated[
+        Literal["whole", "landmark"] | tuple[_Edge, _Edge, _Edge, _Edge], WrapValidator(_named_or_edges)
+    ] = "whole"
     binning: Annotated[int, Field(ge=1, le=MOST_BINNING)] = 1
     margin_deg: Annotated[float, Field(ge=0, le=45)] = DEFAULT_MARGIN_DEG
 
@@ -487,7 +500,10 @@ def sensor_of(name_or_file: str, overrides: dict[str, Any]) -> Sensor:
     if set(overrides) | _YOUNGER_FIELDS >= set(Sensor.model_fields):
         return Sensor(**overrides)
     base = Sensor.from_toml(name_or_file) if _is_file(name_or_file) else preset(name_or_file)
-    return base.with_(**overrides)
+    try:
+        return base.with_(**overrides)
+    except UsageError as error:
+        raise UsageError(f"'sensor_overrides': {error}") from None
 
 
 def sensor_in_folder(sensor: str, folder: Path) -> str:
