@@ -267,7 +267,7 @@ def test_the_error_names_the_units_in_which_every_range_would_be_possible(tmp_pa
     ("unit", "text", "fitting"),
     [
         ("mm", "0.59,0.7,0.8,0.9,1,1.693\n", "unit=m (multiplying by 1000)"),
-        ("mm", "0.59,0.7,0,0.9,0.7,0.3\n", ""),
+        ("mm", "0.59,0.7,0,0.9,0.7,0.3\n", "unit=m (multiplying by 1000)"),
         ("cm", "0.59,0.7,0.8,0.9,0.7,0.3\n", "unit=m (multiplying by 100)"),
     ],
 )

@@ -290,8 +290,8 @@ def _impossible(
         raise InputFileError(f"{path}: every range is 0, which stands for no reading")
     limit_m, reason = _range_limit(sensor)
     if valid.any() and (np.abs(range_m[valid]) < _NEAREST_M).all():
-        fitting = _fitting_units(range_m[valid & ~empty], limit_m, unit)
-        raise InputFileError(f"{path}: every range is below {_NEAREST_M:g} m; is unit=… right?{fitting}")
+        if fitting := _fitting_units(range_m[valid & ~empty], limit_m, unit):
+            raise InputFileError(f"{path}: every range is below {_NEAREST_M:g} m; is unit=… right?{fitting}")
     wrong = valid & ~empty & ~((range_m > 0) & (range_m < limit_m))
     count, of = int(wrong.sum()), int((valid & ~empty).sum())
     if count:
