@@ -207,10 +207,15 @@ def within_ellipsoid(error: ArrayLike, covariance: ArrayLike, level: float = 0.9
     UsageError
         The level is no probability.
     """
+    e = np.asarray(error, np.float64)
+    return np.asarray(nees(e, covariance) <= _size_of_ellipsoid(e.shape[1], level))
+
+
+def _size_of_ellipsoid(p: int, level: float) -> float:
+    """Return the χ² of p numbers that the ellipsoid of a probability reaches."""
     if not 0 < level < 1:
         raise UsageError(f"'level' must be in (0, 1), got {level!r}")
-    e = np.asarray(error, np.float64)
-    return np.asarray(nees(e, covariance) <= special.chdtri(e.shape[1], 1 - level))
+    return float(special.chdtri(p, 1 - level))
 
 
 def view_errors(
@@ -325,6 +330,11 @@ def error_statistics(
     ErrorStatistics
         What nothing is known of is NaN, with an interval that has no bounds.
 
+    Raises
+    ------
+    UsageError
+        A level is no probability, or the law is unknown.
+
     Examples
     --------
     >>> found = error_statistics([[0.1], [-0.1], [0.1]], ["distance_m"], bound_std=[[0.1]] * 3)
@@ -340,7 +350,7 @@ def error_statistics(
     honest = known & np.isfinite(matrix).all(axis=(1, 2))
     scaled = e[bounded] / std[bounded]
     squared = nees(e[honest], matrix[honest])
-    within = {level: int((squared <= special.chdtri(e.shape[1], 1 - level)).sum()) for level in levels}
+    within = {level: int((squared <= _size_of_ellipsoid(e.shape[1], level)).sum()) for level in levels}
     return ErrorStatistics(
         n=int(known.sum()),
         bias={name: mean_interval(e[known, k], law=law) for k, name in enumerate(parameters)},

@@ -106,8 +106,7 @@ class Frames:
         by_frequency: Sequence[Frames] = (),
     ) -> None:
         refuse_no_sensor(sensor)
-        if invalid_means not in ("missing", "no-return"):
-            raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
+        refuse_other_meaning(invalid_means)
         given = ranges = real_array("range_m", np.ma.getdata(range_m))
         if ranges.ndim not in (2, 3, 4):
             raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")
@@ -308,6 +307,18 @@ class Frames:
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
         return figure_png(self.plot()) if self.range_m.size else None
+
+
+def refuse_other_meaning(invalid_means: str) -> None:
+    """Refuse what an invalid pixel cannot stand for.
+
+    Raises
+    ------
+    UsageError
+        It is neither "missing" nor "no-return".
+    """
+    if invalid_means not in ("missing", "no-return"):
+        raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
 
 
 def _checked_flags(flags: ArrayLike) -> NDArray[np.uint8]:

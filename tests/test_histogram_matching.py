@@ -32,6 +32,7 @@ from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
+from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Views, capture, preset
@@ -418,6 +419,18 @@ def test_what_does_not_go_with_histograms_is_refused_in_one_line() -> None:
     ):
         with pytest.raises(UsageError, match=message):
             call()
+
+
+def test_targets_are_looked_up_at_the_bearing_of_the_landmark() -> None:
+    matcher = matcher_of(on="targets", free=None, classes=("cone",))._direct
+    assert isinstance(matcher, TargetMatcher)
+    bearings_rad = np.radians([-3.0, -1.5, 0.0, 1.5, 3.0])
+    assert sorted(table.bearing_rad for table in matcher.tables) == pytest.approx(bearings_rad)
+    views = Views.broadcast(1.1, 0.5, bearings_rad)
+    targets = frames_of("cone", views, np.random.default_rng(31), n_frames=4).targets
+    starts = [matcher._starts(matcher._reported(targets, k))[0] for k in range(len(views))]
+    np.testing.assert_allclose([view[2] for _, view in starts], bearings_rad, atol=1e-9)
+    np.testing.assert_allclose([view[0] for _, view in starts], 1.1, atol=0.02)
 
 
 def test_the_table_states_its_size_before_it_is_made() -> None:

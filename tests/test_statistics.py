@@ -132,6 +132,7 @@ def test_shares_and_levels_are_not_percent_and_not_swapped():
         (lambda: binomial_interval(1, 3, law=wilson), "'law' must be one of student, normal, got 'wilson'"),
         (lambda: mean_interval([1.0, 2.0], law=wilson), "'law' must be one of student, normal"),
         (lambda: within_ellipsoid(np.zeros((1, 2)), np.eye(2)[None], 95), r"'level' must be in \(0, 1\), got 95"),
+        (lambda: error_statistics([[0.1]], ["distance_m"], levels=(95,)), r"'level' must be in \(0, 1\), got 95"),
     ):
         with pytest.raises(UsageError, match=message):
             call()

@@ -37,6 +37,7 @@ from phasemark.data.measured.recording import (
 from phasemark.inputs import opened
 from phasemark.inputs.numbers import in_words
 from phasemark.render import Frames, Sensor
+from phasemark.render.frames import refuse_other_meaning
 from phasemark.render.sensor.sensor import refuse_no_sensor
 from phasemark.render.unwrapped_frames import unwrap_frames
 
@@ -155,8 +156,7 @@ def read_frames(
     path = Path(path)
     if rotate not in (0, 90, 180, 270):
         raise UsageError(f"'rotate' must be 0, 90, 180 or 270, got {rotate!r}")
-    if invalid_means not in ("missing", "no-return"):
-        raise UsageError(f"'invalid_means' must be 'missing' or 'no-return', got {invalid_means!r}")
+    refuse_other_meaning(invalid_means)
     refuse_no_sensor(sensor)
     raw = _read(path, shape_before(sensor, rotate), untrusted, topic, sensor, board)
     if board is not None and raw.valid_status is None:

@@ -138,7 +138,7 @@ class TargetMatcher(DirectMatcher):
     Albedos of a background are as stated, for targets do not tell them.
     """
 
-    _tables_aside = 2  # a degree apart: edges of zones are sharp
+    _tables_aside = 2  # edges of zones are sharp: one standard deviation of the bearing apart
 
     @property
     def table_bytes(self) -> int:
