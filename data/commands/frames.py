@@ -178,8 +178,7 @@ def frames_import(
     *,
     out: Out,
     sensor: SensorName = "pmd-16x16",
-    reading: FrameReading,
-    topic: str | None = None,
+    reading: Annotated[FrameReading, Without("invalid_means")],
     force: Force = False,
 ) -> None:
     """Convert measured frames to one form: range along the ray, in metres, upright.
@@ -190,14 +189,12 @@ def frames_import(
         CSV, NPY, NPZ, HDF5, PNG; a folder of PNG, a bag.
     out
         The measured frames as .npz, range along the ray, metres.
-    topic
-        Which images of a ROS bag.
     """
     from phasemark.data.measured.reading import write_measured
 
     refuse_other_files(out, ".npz", "the output")
     refuse_existing([out], force)
-    frames = reading.read(file, read_sensor(sensor), topic=topic)
+    frames = reading.read(file, read_sensor(sensor))
     echo(write_measured(frames, out, force=force))
 
 

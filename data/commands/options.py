@@ -98,6 +98,8 @@ class FrameReading:
         Turn the image clockwise, degrees.
     board
         Program of a board that printed the file, if several print the same.
+    topic
+        Which images of a ROS bag.
     """
 
     unit: FramesUnitWord | None = None
@@ -108,12 +110,13 @@ class FrameReading:
     flip_v: bool = False
     rotate: Literal[0, 90, 180, 270] = 0
     board: BoardWord | None = None
+    topic: str | None = None
 
-    def read(self, path: Path, sensor: Sensor, *, topic: str | None = None) -> Frames:
+    def read(self, path: Path, sensor: Sensor) -> Frames:
         """Read a file of measured frames, from anywhere."""
         from phasemark.data import read_frames
 
-        return read_frames(path, sensor=sensor, untrusted=True, topic=topic, **vars(self))
+        return read_frames(path, sensor=sensor, untrusted=True, **vars(self))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ Z_TOPIC = "/camera/depth/image_rect"
 RANGE_TOPIC = "/camera/range/image"
 AMPLITUDE_TOPIC = "/camera/amplitude/image"
 INFO_TOPIC = "/camera/depth/camera_info"
+_KINDS = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
 
 
 def ros_types() -> Any:
@@ -70,7 +71,7 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
     from rosbags.rosbag2 import Reader
 
     found: dict[str, list[tuple[float, NDArray[Any]]]] = {}
-    units = set()
+    units, unread = set(), set()
     with Reader(path) as reader:
         of_images = [link for link in reader.connections if link.msgtype == "sensor_msgs/msg/Image"]
         names = [link.topic for link in of_images]
@@ -82,10 +83,13 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
         wanted = [link for link in of_images if link.topic in (chosen, AMPLITUDE_TOPIC)]
         for link, _, raw in reader.messages(connections=wanted):
             message = store.deserialize_cdr(raw, link.msgtype)
+            if link.topic != chosen and message.encoding not in _KINDS:
+                unread.add(message.encoding)
+                continue
             stamp_s = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
             found.setdefault(link.topic, []).append((stamp_s, _pixels(message, path)))
             if link.topic == chosen:
-                units.add("mm" if message.encoding == "16UC1" else "m")
+                units.add("m" if message.encoding == "32FC1" else "mm")
     images, stamped = [image for _, image in found.get(chosen, [])], found.get(AMPLITUDE_TOPIC, [])
     if not images or len({image.shape for image in images}) > 1:
         raise InputFileError(f"{path}: '{chosen}' must hold images of one size")
@@ -103,21 +107,22 @@ def _read(path: Path, topic: str | None, store: Any) -> Recording:
             f"{path}: {len(stamped)} amplitudes of {len(images)} images, not all of the same stamps: left out",
             stacklevel=2,
         )
+    if unread:
+        warnings.warn(f"{path}: amplitudes in images of {', '.join(unread)}: left out", stacklevel=2)
     stated = {"unit": units.pop()}
     if chosen in (RANGE_TOPIC, Z_TOPIC):
         stated["quantity"] = "range" if chosen == RANGE_TOPIC else "z"
     if not any(stamps):  # nobody set them
-        return Recording(arrays, stated)
+        return Recording(arrays, stated, named=True)
     time_s = np.array(stamps)
     note_disorder(time_s, path, "image {}".format)
-    return Recording(arrays, stated, time_s=time_s)
+    return Recording(arrays, stated, time_s=time_s, named=True)
 
 
 def _pixels(message: Any, path: Path) -> NDArray[Any]:
-    kinds = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
-    if message.encoding not in kinds:
+    if message.encoding not in _KINDS:
         raise InputFileError(f"{path}: images must be 32FC1 or 16UC1, got {message.encoding}")
     order = ">" if message.is_bigendian else "<"
-    kind = np.dtype(order + kinds[message.encoding])
+    kind = np.dtype(order + _KINDS[message.encoding])
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)
     return rows[:, : message.width * kind.itemsize].copy().view(kind).astype(np.float64)

@@ -39,6 +39,7 @@ _OBJ_LENGTH = 6 + 2 * 36
 _OBJ_ROWS = ((1, 3, 5, 7), (1, 3, 5, 7), (0, 2, 4, 6), (0, 2, 4, 6))
 _OBJ_COLS = ((0, 1, 4, 5), (2, 3, 6, 7), (0, 1, 4, 5), (2, 3, 6, 7))
 _OBJ_RESULTS = (6, 15, 7, 16, 4, 13, 5, 14, 2, 11, 3, 12, 0, 9, 1, 10)
+_JSON_UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 _JSON_TIMES = {"t_s": 1.0, "t_ms": 1e-3, "timestamp_ms": 1e-3, "ms": 1e-3}
 
 
@@ -176,7 +177,7 @@ def webserial(log: BoardLog) -> Iterator[Printed]:
     for number, text in log.lines():
         frame = log.frame
         if WEBSERIAL.match(text):
-            yield from log.ended()
+            yield from log.ended(cut=True)
             log.begun(number)
         elif frame is not None and text.startswith(("D:", "S:")):
             try:
@@ -297,10 +298,10 @@ def of_object(number: int, text: str) -> Printed:
     try:
         row = json.loads(text)
         distance = row["distances"] if "distances" in row else row["distance_mm"]
+        unit = row.get("unit", "mm")
         status = row["status"] if "status" in row else row.get("target_status", [])
-        frame.distance_mm, frame.status = (
-            [math.nan if value is None else float(value) for value in values] for values in (distance, status)
-        )
+        frame.distance_mm = [math.nan if value is None else _JSON_UNITS[unit] * float(value) for value in distance]
+        frame.status = [math.nan if value is None else float(value) for value in status]
         time = next((name for name in _JSON_TIMES if name in row), None)
         frame.time_s = None if time is None else float(row[time]) * _JSON_TIMES[time]
         if not math.isfinite(frame.time_s or 0.0):
@@ -315,7 +316,7 @@ def of_object(number: int, text: str) -> Printed:
 
 def obj_lines(log: BoardLog) -> Iterator[Printed]:
     """Yield frames of four captures, each a line of 36 results, of which the first objects of 16 zones count."""
-    n_captures = 0
+    n_captures, last = 0, 0
     for number, text in log.lines():
         if not OBJ.match(text):
             log.other(number, text)
@@ -336,6 +337,9 @@ def obj_lines(log: BoardLog) -> Iterator[Printed]:
         frame.distance_mm = frame.distance_mm or [math.nan] * 64
         if capture != n_captures:
             frame.spoil(f"line {number}: got capture {capture} of a frame, must be {n_captures}")
+        if n_captures and (numbers[1] - last) % 256 != 1:
+            frame.spoil(f"line {number}: got result {numbers[1]} behind result {last}: captures of two frames")
+        last = numbers[1]
         for k, result in enumerate(_OBJ_RESULTS):
             place = 8 * _OBJ_ROWS[capture][k // 4] + _OBJ_COLS[capture][k % 4]
             frame.distance_mm[place] = float(numbers[5 + 2 * result])

@@ -16,7 +16,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.data.measured import board_prints as prints
 from phasemark.data.measured.board_prints import BoardLog, Printed
 from phasemark.data.measured.orientation import Orientation
-from phasemark.data.measured.recording import Recording
+from phasemark.data.measured.recording import Recording, note_disorder
 from phasemark.render import Sensor
 
 MOST_LOG_BYTES = 1 << 27
@@ -169,6 +169,7 @@ def read_board_log(file: BinaryIO, board: Board, sensor: Sensor, shape: tuple[in
     for name, values, expected in (("status", status, len(distance)), ("time", times, n_frames)):
         if len(values) not in (0, expected):
             raise InputFileError(f"{path}: some frames have a {name}, others have none")
+    note_disorder(np.array(times), path, "frame {}".format)
     return recording_of(board, distance, status, times, sensor, shape)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
 import math
@@ -69,10 +70,11 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError:
         text = "\0"
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise InputFileError(f"{path}: is not CSV, NPY, NPZ, HDF5 or PNG, but text in UTF-16: write it as UTF-8")
     if "\0" in text:
         raise InputFileError(f"{path}: is not CSV, NPY, NPZ, HDF5 or PNG")
-    first = text.partition("\n")[0]
-    stated = dict(_STATED.findall(first)) if first.startswith("#") else {}
+    stated = stated_in(text)
     lines = [
         (number, line)
         for number, line in enumerate(io.StringIO(text, newline=None), start=1)
@@ -85,8 +87,11 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies:
         names = [name.lower() for name in _cells(lines[0][1], mark)] if lines else []
         if any(name in SECONDS_PER_TIME_UNIT or _group_of(name) for name in names):
             return _parse_named(names, lines, mark, stated, shape, path, n_frequencies)
+        if "mm_0_0" in names:
+            raise InputFileError(f"{path}: a log of targets, not of ranges: match it on targets")
     # quotation marks aside: one that is not closed would make a single cell, and so a header, of a frame
-    header = bool(lines) and _is_header(_cells(lines[0][1].replace('"', ""), separator), separator)
+    first = _cells(lines[0][1].replace('"', ""), separator) if lines else []
+    header = _is_header(first, separator) or (len(lines) > 1 and _are_pixel_numbers(first))
     pixels = f"{shape[0]} × {shape[1]} pixels"
     expected, name = math.prod(shape), "range"
     if n_frequencies > 1 and len(_cells(first_frame, separator)) != expected:
@@ -94,6 +99,12 @@ def parse_csv(content: bytes, shape: tuple[int, int], path: Path, n_frequencies:
         pixels = f"{pixels} at each of {n_frequencies} frequencies"
     body = _Text(path, lines[1 if header else 0 :], separator, expected, pixels)
     return Recording({name: _numbers(body, range(body.expected))}, stated, flat=True)
+
+
+def stated_in(text: str) -> dict[str, str]:
+    """Return unit and quantity, as far as a first line of comment states them."""
+    first = text.partition("\n")[0]
+    return dict(_STATED.findall(first)) if first.startswith("#") else {}
 
 
 def _parse_named(
@@ -271,6 +282,12 @@ def _cells(line: str, separator: str | None) -> list[str]:
 def _is_header(cells: list[str], separator: str | None) -> bool:
     filled = [cell for cell in cells if cell.lower() not in _NOT_A_NUMBER]
     return bool(filled) and all(_to_float(cell, separator) is None for cell in filled)
+
+
+def _are_pixel_numbers(cells: list[str]) -> bool:
+    """Return whether a line counts the pixels from 0 or 1, as a table's header of numbers does."""
+    fewest_pixels = 9
+    return len(cells) >= fewest_pixels and cells in ([str(k + first) for k in range(len(cells))] for first in (0, 1))
 
 
 def _to_float(cell: str, separator: str | None) -> float | None:

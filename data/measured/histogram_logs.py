@@ -18,9 +18,12 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
+from phasemark.data.measured.csv_frames import stated_in
+from phasemark.data.measured.possible_ranges import impossible_ranges
 from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, npz_arrays
 from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
+from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames, reference_centroid
 from phasemark.render.direct.recordings import PlaneRecording
 from phasemark.render.direct.targets import Status, Targets
@@ -201,6 +204,10 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     path = Path(path)
     text = read_whole(path, most_bytes=_MOST_BYTES).decode("utf-8-sig", errors="replace")
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    stated, reports = stated_in(text), histogram_of(sensor).reports
+    for name, right in (("unit", "mm"), ("quantity", reports)):
+        if stated.get(name, right) != right:
+            raise InputFileError(f"{path}: must have {name}={right}, as the sensor reports it, got {stated[name]}")
     if len(lines) < 2:
         raise InputFileError(f"{path}: must have a header and at least one frame")
     header = [name.strip() for name in lines[0].split(",")]
@@ -214,6 +221,8 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
                 raise InputFileError(
                     f"{path}: column '{name}' is beyond {n_zones} zones of at most {most_listed} targets"
                 )
+            if (kind, zone, target) in places:
+                raise InputFileError(f"{path}: names the column '{name}' twice")
             places[kind, zone, target] = column
     if not any(kind == "mm" for kind, *_ in places):
         raise InputFileError(f"{path}: must have columns mm_0_0 … (zone, target), got {', '.join(header[:4])} …")
@@ -226,16 +235,24 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
             raise InputFileError(f"{path}: frame {row} has {len(cells)} cells, the header {len(header)}")
         for (kind, place, k), column in places.items():
             out[kind][row, place, k] = _cell(cells[column].strip(), path, row, header[column])
+    zones = {zone for kind, zone, _ in places if kind == "mm"}
+    if max(zones) < n_zones - 1:
+        raise InputFileError(f"{path}: has columns of {max(zones) + 1} zones, but the sensor has {n_zones}")
     has_status = any(kind == "status" for kind, *_ in places)
-    listed = np.isin(out["status"], list(valid_status)) if has_status else np.isfinite(out["mm"])
-    valid = listed & np.isfinite(out["mm"]) & (out["mm"] > 0)
-    columns = (
-        np.where(valid, out["mm"] / 1000, np.nan),
-        np.where(valid, out["sigma_mm"] / 1000, np.nan),
-        np.where(valid, np.nan_to_num(out["signal"]), 0.0),
+    for kind, zone, target in places:
+        if has_status and kind == "mm" and ("status", zone, target) not in places:
+            raise InputFileError(f"{path}: has no 'status_{zone}_{target}', but others")
+    placed = {kind: _image(each, sensor).reshape(1, -1, sensor.rows, sensor.cols, most) for kind, each in out.items()}
+    distance_m = placed["mm"] / 1000
+    listed = np.isin(placed["status"], list(valid_status)) if has_status else np.isfinite(distance_m)
+    valid = listed & np.isfinite(distance_m) & (distance_m > 0)
+    valid &= ~impossible_ranges(distance_m, valid, sensor, "mm", path, is_stated=True)
+    return Targets(
+        np.where(valid, distance_m, np.nan),
+        np.where(valid, placed["sigma_mm"] / 1000, np.nan),
+        np.where(valid, np.nan_to_num(placed["signal"]), 0.0),
         np.where(valid, int(Status.VALID), int(Status.NO_TARGET)).astype(np.uint8),
     )
-    return Targets(*(_image(values, sensor).reshape(1, -1, sensor.rows, sensor.cols, most) for values in columns))
 
 
 def _image(values: NDArray[Any], sensor: Sensor) -> NDArray[Any]:

@@ -24,6 +24,7 @@ from phasemark.data.measured.bags import read_rosbag
 from phasemark.data.measured.boards import HEAD_BYTES, MOST_LOG_BYTES, find_board, read_board_log
 from phasemark.data.measured.csv_frames import parse_csv
 from phasemark.data.measured.orientation import Orientation
+from phasemark.data.measured.possible_ranges import METRES_PER_UNIT, impossible_ranges
 from phasemark.data.measured.recording import (
     SECONDS,
     SECONDS_PER_TIME_UNIT,
@@ -45,15 +46,13 @@ Unit = Literal["m", "cm", "mm"]
 RangeOrZ = Literal["range", "z"]
 InvalidMeans = Literal["missing", "no-return"]
 
-_NEAREST_M = 0.01
-"""No sensor reads less in all pixels."""
-METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 QUANTITIES = ("range", "z")
 
 _NUMBERS = ("range", "amplitude", "intensity")
 _OF_FREQUENCY = tuple(f"frequency_{name}" for name in _NUMBERS)
 _COLUMNS = (*_NUMBERS, "status", "valid", *_OF_FREQUENCY, "frequency", "taps", *SECONDS_PER_TIME_UNIT, *TILTS)
 """Arrays of NPZ and HDF5 files that are read."""
+_BESIDE = ("flags", "simulated")
 _MOST_PIXELS = 1 << 24
 _ELECTRONS = ("e", "e-", "electron", "electrons")
 _MOST_BYTES = 1 << 26
@@ -233,7 +232,8 @@ def frames_of(
         if settled_quantity == "z":
             range_m = range_m / sensor.axis_cosine()
         usable = valid & np.isfinite(range_m)
-        usable &= ~_impossible(range_m, usable, camera, settled_unit, path)
+        usable &= ~impossible_ranges(range_m, usable, camera, settled_unit, path, is_stated="unit" in raw.stated)
+        _note_repeated(np.where(usable, range_m, np.nan), path)
         amplitude, intensity = numbers.get("amplitude"), numbers.get("intensity")
         return Frames(
             range_m, amplitude, intensity, usable, sensor=camera, taps_e=taps, invalid_means=invalid_means,
@@ -271,52 +271,6 @@ def _of_each_frame(values: NDArray[np.float64], what: str, shape: tuple[int, ...
     if values.size != math.prod(shape) or values.shape not in (shape, shape[1:], ()):
         raise InputFileError(f"{path}: {what} must have one number for each frame, shape {shape}, got {values.shape}")
     return values.reshape(shape)
-
-
-def _range_limit(sensor: Sensor) -> tuple[float, str]:
-    """Return the range below which all readings of a sensor lie, metres, and where the limit comes from."""
-    if sensor.kind == "direct" and sensor.max_range_m is not None:
-        # how far beyond `max_range_m` a direct sensor may still report: real chips exceed their data sheet by a little
-        beyond_max_range = 1.25
-        return beyond_max_range * sensor.max_range_m, f"{beyond_max_range:g} times the sensor's 'max_range_m'"
-    return sensor.unambiguous_range_m, "c / 2f"
-
-
-def _impossible(
-    range_m: NDArray[np.float64], valid: NDArray[np.bool_], sensor: Sensor, unit: str, path: Path
-) -> NDArray[np.bool_]:
-    empty = valid & (range_m == 0)  # how most sensors write that they have no reading: it says nothing of the unit
-    if valid.any() and empty.sum() == valid.sum():
-        raise InputFileError(f"{path}: every range is 0, which stands for no reading")
-    limit_m, reason = _range_limit(sensor)
-    if valid.any() and (np.abs(range_m[valid]) < _NEAREST_M).all():
-        if fitting := _fitting_units(range_m[valid & ~empty], limit_m, unit):
-            raise InputFileError(f"{path}: every range is below {_NEAREST_M:g} m; is unit=… right?{fitting}")
-    wrong = valid & ~empty & ~((range_m > 0) & (range_m < limit_m))
-    count, of = int(wrong.sum()), int((valid & ~empty).sum())
-    if count:
-        place = np.argwhere(wrong)[0]
-        message = (
-            f"{path}: {count} of {of} ranges are not in 0 … {limit_m:.4g} m ({reason}), the first in"
-            f" frame {place[1]}, row {place[2]}, column {place[3]}: {range_m[tuple(place)]:.6g} m"
-        )
-        if 2 * count > of:
-            readings_m = range_m[valid & ~empty]
-            raise InputFileError(f"{message}; is unit=… right?{_fitting_units(readings_m, limit_m, unit)}")
-        warnings.warn(f"{message}; taken as invalid", UserWarning, stacklevel=3)
-    return np.asarray(wrong | empty)
-
-
-def _fitting_units(readings_m: NDArray[np.float64], limit_m: float, unit: str) -> str:
-    """Return a sentence that names the other units in which all readings would be possible, if there are any."""
-    factors = {name: metres / METRES_PER_UNIT[unit] for name, metres in METRES_PER_UNIT.items() if name != unit}
-    usual_m, least_m, most_m = np.median(readings_m), readings_m.min(), readings_m.max()
-    fitting = [
-        f"unit={name} ({f'dividing by {1 / factor:g}' if factor < 1 else f'multiplying by {factor:g}'})"
-        for name, factor in factors.items()
-        if least_m > 0 and most_m * factor < limit_m and usual_m * factor > _NEAREST_M
-    ]
-    return f" All would fit with {' or '.join(fitting)}" if fitting else ""
 
 
 def _settled(name: str, given: str | None, raw: Recording, known: tuple[str, ...], path: Path) -> str:
@@ -606,7 +560,9 @@ def _read_npz(file: BinaryIO, size: int, path: Path) -> Recording:
             if "histogram" in archive:
                 raise InputFileError(f"{path}: a log of histograms, not of ranges: match it on histograms")
             raise InputFileError(f"{path}: must have an array 'range', got {', '.join(archive) or 'nothing'}")
-        return _of_arrays(archive, own, {name: str(archive[name]) for name in words}, path)
+        if "view" not in members:  # an exported frame set has more, which is documented
+            _note_ignored(members.keys() - {*_COLUMNS, *words}, path)
+        return _of_arrays(archive, own, {name: _word(archive[name]) for name in words}, path)
 
 
 def _read_hdf5(path: Path, untrusted: bool) -> Recording:
@@ -619,6 +575,9 @@ def _read_hdf5(path: Path, untrusted: bool) -> Recording:
                 f"{path}: must have a dataset 'range', "
                 + (f"but is a {kind}" if kind else f"got {', '.join(file) or 'nothing'}")
             )
+        for name, dataset in datasets.items():
+            if dataset.attrs.get("scale_factor", 1) != 1 or dataset.attrs.get("add_offset", 0) != 0:
+                raise InputFileError(f"{path}: '{name}' is packed (scale_factor, add_offset): write its numbers")
         for name in (*_NUMBERS[1:], *_OF_FREQUENCY[1:]):
             units = datasets[name].attrs.get("units") if name in datasets else None
             if units is not None and units not in _ELECTRONS:
@@ -627,8 +586,40 @@ def _read_hdf5(path: Path, untrusted: bool) -> Recording:
         for name, dataset in datasets.items():
             room.take(name, dataset.shape, dataset.dtype)
         attributes = {"unit": "units", "quantity": "quantity"}
-        stated = {name: str(main.attrs[key]) for name, key in attributes.items() if key in main.attrs}
+        stated = {name: _word(main.attrs[key]) for name, key in attributes.items() if key in main.attrs}
+        if "format" not in file.attrs:  # a frame set of ours has more, which is documented
+            others = {name for name in file if isinstance(file.get(name), h5py.Dataset)}
+            _note_ignored(others - set(_COLUMNS), path)
         return _of_arrays(datasets, datasets, stated, path)
+
+
+def _word(value: Any) -> str:
+    """Return a word of a file, which some programs write as bytes."""
+    plain = value.item() if np.size(value) == 1 and hasattr(value, "item") else value
+    return plain.decode("utf-8", errors="replace") if isinstance(plain, bytes) else str(plain)
+
+
+def _note_repeated(range_m: NDArray[np.float64], path: Path) -> None:
+    """Warn of frames that equal the one before in every pixel, where others do not: they are no measurements."""
+    known = np.isfinite(range_m)
+    same = ((range_m[:, 1:] == range_m[:, :-1]) | ~(known[:, 1:] | known[:, :-1])).all(axis=(2, 3))
+    repeated = same & known[:, 1:].any(axis=(2, 3))
+    count, fewest = int(repeated.sum()), 3  # fewer do no harm
+    if count >= fewest and not same.all():
+        position, frame = np.argwhere(repeated)[0]
+        where = f"frame {frame + 1}" + (f" of position {position}" if len(range_m) > 1 else "")
+        warnings.warn(
+            f"{path}: {count} of {known.shape[0] * known.shape[1]} frames repeat the one before to the last digit, the"
+            f" first being {where}: were they read faster than the sensor measures? Each counts as a measurement",
+            stacklevel=2,
+        )
+
+
+def _note_ignored(names: Collection[str], path: Path) -> None:
+    """Warn of arrays that are not read, but for those that programs of ours write beside the frames."""
+    foreign = sorted(name for name in names if name not in _BESIDE and not name.startswith("truth_"))
+    if foreign:
+        warnings.warn(f"{path}: ignores the arrays {', '.join(foreign)}", stacklevel=2)
 
 
 def _of_arrays(file: Mapping[str, Any], names: Iterable[str], stated: Mapping[str, str], path: Path) -> Recording:

@@ -41,7 +41,7 @@ class Recording:
     flat : bool
         Whether frames are rows of rows · cols values.
     named : bool
-        Whether names of columns state unit or quantity.
+        Whether names of columns, or encodings of images, state one of unit and quantity.
     valid_status : tuple of int, optional
         Of the board that printed it.
     """

@@ -60,10 +60,24 @@ def frames_of_poses(frames: Sequence[Frames], poses: KnownPoses) -> list[Frames]
                 " 'frames' with the number of each"
             )
         counts = np.full(n, total // n)
+        _refuse_other_stamps(whole, poses, total // n)
     if counts.sum() != total:
         raise UsageError(f"the poses claim {counts.sum()} frames in all, but there are {total}")
     ends = np.cumsum(counts)
     return [whole.some_frames(int(end - count), int(end)) for count, end in zip(counts, ends, strict=True)]
+
+
+def _refuse_other_stamps(whole: Frames, poses: KnownPoses, count: int) -> None:
+    """Refuse poses whose stamps are within the frames of others, if each has a number of them in turn."""
+    if whole.time_s is None or poses.time_s is None:
+        return
+    times = whole.time_s.reshape(-1, count)
+    among = (times[:, 0] <= poses.time_s[:, None]) & (poses.time_s[:, None] <= times[:, -1])
+    for k, other in np.argwhere(among & ~np.eye(len(poses), dtype=np.bool_)).tolist():
+        raise UsageError(
+            f"{poses.where(k)}: its stamp is among the frames of {poses.where(other)} if each has {count} of them: give"
+            " a column 'frames' with the number of each"
+        )
 
 
 def filter_poses(frames: Sequence[Frames], on: Explained = "auto") -> FilteredFrames:

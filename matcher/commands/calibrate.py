@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.commands.command import Shown, refuse_options
-from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable
+from phasemark.data.commands.console import LongWork, echo, echo_json, echo_table, readable, tell
 from phasemark.data.commands.flag_wording import in_flags
 from phasemark.data.commands.inputs import background_to_estimate, class_mesh, note_too_far, open_any_bank, read_sensor
 from phasemark.data.commands.options import (
@@ -207,6 +207,7 @@ def _filtered(
     """Return the frames of each recording one by one, and those of a still camera averaged at each pose."""
     from phasemark.matcher import kalman_filter
     from phasemark.matcher.calibration import filter_poses, frames_of_poses
+    from phasemark.matcher.recordings.stillness import motion_note
 
     if moving:
         if len(measured) != len(known):
@@ -217,7 +218,10 @@ def _filtered(
         return [kalman_filter(one.each_a_position()) for one in measured]
     if len(known) != 1:
         raise UsageError(f"still poses are one file of them all, got {len(known)} --poses (recordings take --moving)")
-    return [filter_poses(frames_of_poses(measured, known[0]), on)]
+    of_poses = frames_of_poses(measured, known[0])
+    if note := motion_note(of_poses):
+        tell(f"note: {note}; a recording of a moving camera takes --moving")
+    return [filter_poses(of_poses, on)]
 
 
 def _fixed_names(fix: str | None, delay_ms: float | None, moving: bool) -> list[str]:

@@ -18,7 +18,7 @@ from phasemark.data.commands.command import Shown, Without
 from phasemark.data.commands.console import LongWork, echo_json, tell
 from phasemark.data.commands.inputs import open_any_bank, read_landmark, read_sensor
 from phasemark.data.commands.options import Force, FrameReading, Json, MeshReading, SensorName
-from phasemark.data.commands.outputs import refuse_input_files
+from phasemark.data.commands.outputs import refuse_existing, refuse_input_files
 from phasemark.matcher.commands.match_options import Landmark, Search, check_delay
 
 if TYPE_CHECKING:
@@ -114,7 +114,8 @@ def live_poses(
     from phasemark.matcher.live.openers import files_of_sinks
 
     motion.check()
-    refuse_input_files(files_of_sinks(to or []))
+    refuse_input_files(written := files_of_sinks(to or []))
+    refuse_existing([file for file in written if not file.is_fifo()], force)
     with ExitStack() as stack:
         if landmark_name is not None and map_file is None and rig_file is None:
             shown: Bank | None = (bank := stack.enter_context(_bank(landmark_name, mesh, sensor, distance)))
@@ -127,10 +128,12 @@ def live_poses(
             found, make = _among_walls(source, rig_file, map_file, map_name, motion, not at_once)
         else:
             raise UsageError("give --landmark BANK|MESH|CLASS, or --map TOML and --rig TOML")
-        sinks = [open_sink(name, None if shown is None else shown.camera, force=force) for name in to or ["-"]]
         with LongWork("getting bank and kernels ready"):
             tracker = make()
             tracker.warm()
+        # files last, for a file that is opened is emptied
+        names = sorted(to or ["-"], key=lambda name: (bool(files_of_sinks([name])), name.startswith("jsonl:")))
+        sinks = [open_sink(name, None if shown is None else shown.camera, force=force) for name in names]
         sinks += _views(shown, page, view)
         session = Live(found, tracker, sinks, delay_s=tracker.delay_s, say=lambda line: tell(f"note: {line}"))
         _until_interrupted(session, shows_status=not view and sys.stderr.isatty())

@@ -349,15 +349,7 @@ def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
 
 def _note_motion(measured: Frames, file: Path) -> None:
     """Warn that frames to be averaged were not taken at rest."""
-    import numpy as np
+    from phasemark.matcher.recordings.stillness import motion_note
 
-    from phasemark.matcher.recordings.stillness import motion_test
-
-    moved = np.flatnonzero(motion_test(measured).moved())
-    if moved.size:
-        n = len(measured)
-        where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
-        tell(
-            f"note: {file}: the camera or the scene moved during {where}, so that the mean of the frames is no single"
-            " view; --moving matches every frame by itself"
-        )
+    if note := motion_note([measured]):
+        tell(f"note: {file}: {note}; --moving matches every frame by itself")

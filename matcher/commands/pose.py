@@ -84,8 +84,9 @@ def _truth_of(
         if len(positions) < len(found):
             twice = int(positions[counts > 1][0])
             raise UsageError(f"{estimates}: position {twice} has more than one estimate: give each once")
-    by_position = true.time_s is None or found.time_s is None or len(true) == len(found)
-    if by_position:
+    if true.time_s is None or found.time_s is None:
+        if delay_s:
+            raise UsageError("--delay takes stamps (t_s) in both files")
         index = np.arange(len(found)) if found.index is None else found.index
         if index.min() < 0 or index.max() >= len(true):
             raise UsageError(

@@ -9,7 +9,6 @@ report peaks of the noise too: how many of these are expected follows from the a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -38,14 +37,15 @@ from phasemark.render.direct.view_signals import STEPS, views_about
 from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
-_ASIDE_RAD = math.radians(6.0)
-_WORTH_ANOTHER_TRY = 2 * DISAGREEMENT
 _STARTS, _FIRST_STEPS, _FOLLOWED, _STEPS, _SHARES = 24, 2, 6, 6, (1.0, 0.3)
 """Of 60 frames of five random parts a start led to the right hill on 58: one of the first 12."""
 _EVERY = 2  # targets are looked up at every second distance of the grid: a start may lie between them
 _APART_RAD = math.radians(5.0)
 """Between starts of a class."""
 _DONE = 0.01  # squared standard deviations
+_BLUR_M = (5e-3, 1e-3)
+"""Fits begin with targets that are known no better than this: sigmas may be a tenth of a millimetre, and a target that
+is off by more than five of them has no slope."""
 _LEAST_STD_M = 1e-5
 _BETTER_FITS, _BETTER = 2, 0.1
 """Where a view a few standard deviations aside of the best fit explains the targets better, a fit begins there."""
@@ -124,6 +124,10 @@ class _Fit:
     def gradient(self) -> NDArray[np.float64]:
         """Minus half the slope of the cost, (p,)."""
         return np.asarray(self._with_slopes.gradient - self._matcher.prior_weight * self.view[self._matcher.columns])
+
+    def of(self, frame: Reported) -> _Fit:
+        """Return the comparison of other targets at the same view."""
+        return _Fit(self._matcher, frame, self.class_index, self.view)
 
     def moved(self, step: NDArray[np.float64]) -> _Fit:
         """Return the comparison at a view a step away, within the limits."""
@@ -221,14 +225,15 @@ class TargetMatcher(DirectMatcher):
     def _match(self, frame: Reported) -> Match:
         if not len(frame.zone):
             return no_answer(self.rules)
-        begun = [self._fit(_Fit(self, frame, *start), _FIRST_STEPS) for start in self._starts(frame)]
+        coarse, fine = (frame._replace(std_m=np.hypot(frame.std_m, blur_m)) for blur_m in _BLUR_M)
+        begun = [self._fit(_Fit(self, coarse, *start), _FIRST_STEPS) for start in self._starts(frame)]
         begun.sort(key=lambda fit: fit.cost)
-        fits = [self._fit(fit) for fit in begun[:_FOLLOWED]]
-        fits += self._beside(frame, fits)
+        sharper = [self._fit(fit.of(fine), _FIRST_STEPS) for fit in begun[:_FOLLOWED]]
+        fits = [self._fit(fit.of(frame)) for fit in sharper]
         best_index = int(np.argmin([fit.cost for fit in fits]))
         fits[best_index] = self._lessened(frame, fits[best_index])
         found = [Explanation(fit.class_index, fit.view, fit.cost, fit.information) for fit in fits]
-        found += [Explanation(fit.class_index, fit.view, fit.cost, None) for fit in begun[_FOLLOWED:]]
+        found += [Explanation(fit.class_index, fit.view, fit.of(frame).cost, None) for fit in begun[_FOLLOWED:]]
         best, compared = fits[best_index], fits[best_index].compared
         expected = max(frame.n_frames * self._false_targets, 0.05)
         dof = compared.n_compared - len(self.free)
@@ -278,20 +283,6 @@ class TargetMatcher(DirectMatcher):
             if len(starts) == _STARTS:
                 break
         return starts
-
-    def _beside(self, frame: Reported, fits: Sequence[_Fit]) -> list[_Fit]:
-        """Return fits that begin a little aside of the best one of every class: a step may end before a small hill."""
-        more = []
-        least = min(fit.cost for fit in fits)
-        for c in range(len(self.signals)):
-            best = min((fit for fit in fits if fit.class_index == c), key=lambda fit: fit.cost, default=None)
-            if best is None or best.cost > least + _WORTH_ANOTHER_TRY:
-                continue
-            for aside in (-_ASIDE_RAD, _ASIDE_RAD):
-                start = best.view.copy()
-                start[1] += aside
-                more.append(self._fit(_Fit(self, frame, c, np.clip(start, *self.limits))))
-        return more
 
     def _fit(self, begin: _Fit, most: int = _STEPS) -> _Fit:
         """Refine a view."""

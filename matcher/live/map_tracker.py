@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,11 @@ class MapTracker:
         """
         step_s, jumps, note = step_between(self._stamp_s, stamp_s)
         now = None if frames.odometry is None else frames.odometry[0]
+        is_late = bool(self.locator.rig.numbers().delay_s.any())
+        if is_late and step_s > 0 and not jumps and now is not None and self._odometry is not None:
+            earlier = np.concatenate([[-step_s], relative_pose(now, self._odometry)])
+            frames = replace(frames, earlier=earlier[None])
+        moves = frames.earlier is not None or frames.depth_m.shape[1] > 1
         if jumps:
             self._prior = None
         elif self._prior is not None and now is not None and self._odometry is not None:
@@ -59,7 +65,9 @@ class MapTracker:
             found.accepted, found.reason, found.pose if known else None, found.covariance if known else None,
             others[0][0] if others else 0.0, found.accepted, poses=others,
         )  # fmt: skip
-        return Located(estimate, None, None, expected and found.accepted, note=note)
+        # a frame without odometry around it shows where the robot was when its sensors saw it
+        aged_s = 0.0 if moves else float(self.locator.rig.numbers().delay_s.mean())
+        return Located(estimate, None, None, expected and found.accepted, note=note, aged_s=aged_s)
 
     def warm(self) -> None:
         """Locate a simulated frame, with a start and without: kernels are there before the first frame is."""

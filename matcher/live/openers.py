@@ -33,7 +33,7 @@ def open_source(name: str, sensor: Sensor, how: Mapping[str, Any] | None = None,
     sensor : Sensor
         The camera.
     how : mapping, optional
-        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean, `board` among them.
+        Keywords of :func:`~phasemark.data.read_frames` that tell what the numbers mean, `board` and `topic` among them.
     in_time : bool
         Whether frames of a recording come in the rhythm of their stamps.
 

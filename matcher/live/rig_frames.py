@@ -59,14 +59,19 @@ class RigLines(StreamSource):
             try:
                 row = self._row(text)
                 if row["sensor"] in held or any(one["time_s"] != row["time_s"] for one in held.values()):
-                    yield self._frame(held, lines)
+                    yield self._frame(held)
                     held = {}
-                held[row["sensor"]] = row
+                held[row["sensor"]] = {**row, "received_s": lines.received_s}
                 if len(held) == len(self._rig.names):
-                    yield self._frame(held, lines)
+                    yield self._frame(held)
                     held = {}
             except InputFileError as error:
                 held = {}
+                self.spoilt(str(error))
+        if held and not lines.is_stopped:  # the last frame lacks a sensor
+            try:
+                yield self._frame(held)
+            except InputFileError as error:
                 self.spoilt(str(error))
 
     def _row(self, text: str) -> dict[str, Any]:
@@ -90,7 +95,7 @@ class RigLines(StreamSource):
         return {"sensor": name, "z_m": zones, "status": np.reshape(status, shape), "time_s": printed.time_s,
                 "odometry": odometry}  # fmt: skip
 
-    def _frame(self, held: dict[str, dict[str, Any]], lines: Lines) -> Arrival:
+    def _frame(self, held: dict[str, dict[str, Any]]) -> Arrival:
         """Return lines of several sensors as one frame, invalid where a sensor sent nothing."""
         names, last = self._rig.names, list(held.values())[-1]
         self._heard |= held.keys()
@@ -110,7 +115,7 @@ class RigLines(StreamSource):
         if odometry is not None:
             axes = ("odometry_x_m", "odometry_y_m", "odometry_yaw_rad")
             arrays |= {key: np.array([value]) for key, value in zip(axes, odometry, strict=True)}
-        return Arrival(rig_recording(arrays, Path(self.name), self._rig), lines.received_s)
+        return Arrival(rig_recording(arrays, Path(self.name), self._rig), last["received_s"])
 
 
 class RecordedRig(Replay):

@@ -162,7 +162,7 @@ class Live:
         self.status.damaged = self.source.n_damaged
         why = located.match.reason if located.match is not None else ""
         self.status.note(f"{reason}: {why}" if reason and why else reason, latency_s, located.tracked)
-        shown = stamp + self._delay_s
+        shown = stamp + self._delay_s - located.aged_s
         on_ours = shown + self._offset(stamp, received) if self.source.is_live else shown
         return Update(self._number, arrival.frames, stamp, shown, on_ours, located, reason, latency_s)
 

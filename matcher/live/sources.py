@@ -30,6 +30,8 @@ STALLS_AFTER_S = 1.0
 """A source that sends nothing for longer is opened again."""
 LONGEST_LINE = 1 << 16
 _HEADER = re.compile(r"(^|[;,\t ])\"?(mm|range|z)_0\"?([;,\t ]|$)")
+_OF_FILES = ("board", "topic")
+"""Of the options of reading those that choose what of a file is read."""
 _UNRECOGNISED_LINES = 256
 """Lines after which a source is said to be of no known format."""
 
@@ -150,7 +152,7 @@ class PrintedSource(StreamSource):
     def __init__(self, stream: Stream, sensor: Sensor, how: Mapping[str, Any]) -> None:
         super().__init__(stream)
         self._sensor = sensor
-        self._how = {key: value for key, value in how.items() if key != "board"}
+        self._how = {key: value for key, value in how.items() if key not in _OF_FILES}
         self._named: str | None = how.get("board")
         self._shape = shape_before(sensor, int(how.get("rotate", 0)))
         self._path = Path(self.name)
@@ -255,7 +257,7 @@ class Tmf8829Source(Source):
         host, port = address_of(name)
         self._address = f"tcp://{host or '127.0.0.1'}:{port}"
         self._sensor = sensor
-        self._how = {key: value for key, value in how.items() if key != "board"}
+        self._how = {key: value for key, value in how.items() if key not in _OF_FILES}
         self._shape = shape_before(sensor, int(how.get("rotate", 0)))
 
     def frames(self) -> Iterator[Arrival]:

@@ -94,6 +94,10 @@ class Lines:
             if found:
                 self._held += found
                 self._since = self.received_s = now
+            elif found is not None and self._held and self._stream.ends:  # a last line without an end
+                line = bytes(self._held)
+                self._held.clear()
+                return line
             elif found is not None:
                 self.fault = "has ended"
                 return b""

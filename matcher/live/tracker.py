@@ -42,6 +42,8 @@ class Located:
         Number of the earlier frame whose full search was used.
     note : str
         What was noticed: a jump of the clock.
+    aged_s : float
+        By how much the pose is older than the frame's stamp, beside the delay of the sensor.
     """
 
     estimate: Estimate
@@ -50,6 +52,7 @@ class Located:
     tracked: bool = False
     searched: int | None = None
     note: str = ""
+    aged_s: float = 0.0
 
 
 class Locator(Protocol):

@@ -58,6 +58,9 @@ class RigRecording:
         What each stop has wrong: sensors that are stuck, odometry that jumps; empty strings elsewhere.
     zone_m : (n, F, S, R, C) float64, optional
         The depths of zones that those of columns were made from, row 0 at the top; None: the recording has no rows.
+    earlier : (n, 4) float64, optional
+        A time before the first frame of each stop, seconds less than 0 after that, and the odometry then, as `moved`.
+        Data that are older than the first frame are older than the odometry that a stop begins with.
     """
 
     depth_m: _Float
@@ -71,6 +74,7 @@ class RigRecording:
     robot_key: str = "robot"
     notes: tuple[str, ...] = ()
     zone_m: _Float | None = None
+    earlier: _Float | None = None
 
     def __len__(self) -> int:
         return len(self.depth_m)
@@ -79,7 +83,10 @@ class RigRecording:
         """Return the frames of a stop, or some of them."""
         used = np.arange(self.depth_m.shape[1]) if frames is None else np.asarray(frames)
         depth, time_s = np.ascontiguousarray(self.depth_m[k][used]), self.time_s[k] - self.time_s[k, 0]
-        return Scan(time_s[used], depth, time_s, np.ascontiguousarray(self.moved[k]))
+        track = np.column_stack([time_s, self.moved[k]])
+        if self.earlier is not None:
+            track = np.vstack([self.earlier[k], track])
+        return Scan(time_s[used], depth, track[:, 0].copy(), track[:, 1:].copy())
 
     def zones(self, k: int, most: int) -> Scan | None:
         """Return the zones of a stop, row by row, in at most `most` of its frames; None without rows or zones."""
@@ -96,7 +103,9 @@ class RigRecording:
         """Return the recording of one stop alone."""
         own = slice(k, k + 1)
         cut = {name: getattr(self, name)[own] for name in ("depth_m", "time_s", "moved", "stop", "robot", "notes")}
-        cut |= {name: value[own] for name in ("odometry", "zone_m") if (value := getattr(self, name)) is not None}
+        cut |= {
+            name: value[own] for name in ("odometry", "zone_m", "earlier") if (value := getattr(self, name)) is not None
+        }
         return replace(self, **cut)
 
     def first_frames(self, n: int) -> Self:
@@ -274,16 +283,17 @@ def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: in
     """Return the motion within each stop in the body's frame, and the pose at its first frame."""
     at_first = None
     names = ("odometry_x_m", "odometry_y_m", "odometry_yaw_rad")
-    if names[0] in arrays:
+    if any(name in arrays for name in names):
         columns = [_number_array(_needed(arrays, name, path), path, name, (n,), True) for name in names]
         at_first = np.column_stack(columns)
     within = ("odo_dx_m", "odo_dy_m", "odo_dyaw_rad")
-    if within[0] not in arrays:
+    if not any(name in arrays for name in within):
         return np.zeros((n, frames, 3)), at_first
     columns = [_number_array(_needed(arrays, name, path), path, name, (n, frames), True) for name in within]
     world = np.stack(columns, axis=-1)
+    world[..., 2] = np.unwrap(world[..., 2], axis=1)
     if at_first is None:
-        raise InputFileError(f"{path}: '{within[0]}' needs '{names[2]}', the yaw at the first frame")
+        raise InputFileError(f"{path}: '{within[-1]}' needs '{names[2]}', the yaw at the first frame")
     cos, sin = np.cos(at_first[:, 2, None]), np.sin(at_first[:, 2, None])
     x, y = cos * world[..., 0] + sin * world[..., 1], cos * world[..., 1] - sin * world[..., 0]
     return np.stack([x, y, world[..., 2]], axis=-1), at_first

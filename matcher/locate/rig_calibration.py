@@ -190,7 +190,10 @@ class _Problem:
         self.of_map = [next(m for m, other in enumerate(self.maps) if other is one) for one in wall_maps]
         self.stops = [(r, k) for r, table in enumerate(poses) for k in range(len(table)) if np.isfinite(table[k]).all()]
         if len(self.stops) < _FEWEST_STOPS:
-            raise UsageError(f"at least {_FEWEST_STOPS} stops must have a pose, got {len(self.stops)}")
+            raise UsageError(
+                f"at least {_FEWEST_STOPS} stops must have a pose, got {len(self.stops)} by the recording's run, stop"
+                " and robot"
+            )
         self.theta: dict[tuple[int, int], _Float] = {}
         self.doubt = {stop: np.ones(3) for stop in self.stops}
         self.groups = sorted({(r, int(recordings[r].robot[k])) for r, k in self.stops})

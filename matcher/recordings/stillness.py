@@ -7,6 +7,7 @@ ratio). This needs no noise level. *Scatter*: most pixels scatter far more than 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -94,6 +95,23 @@ def motion_test(frames: Frames) -> MotionTest:
     p_order, correlation = _order(ranges)
     p_scatter, excess = _scatter(ranges, frames)
     return MotionTest(np.minimum(1.0, 2 * np.minimum(p_order, p_scatter)), correlation, excess)
+
+
+def motion_note(places: Sequence[Frames]) -> str:
+    """Return in words at which positions something moved, "" if nowhere.
+
+    Parameters
+    ----------
+    places : sequence of Frames
+        Those of some positions after those of others.
+    """
+    tests = [motion_test(frames) for frames in places]
+    test = MotionTest(*(np.concatenate([getattr(one, name) for one in tests]) for name in vars(tests[0])))
+    n, moved = len(test.p_value), np.flatnonzero(test.moved())
+    if not moved.size:
+        return ""
+    where = "the file" if n == 1 else f"{len(moved)} of {n} positions, the first being {moved[0]}"
+    return f"the camera or the scene moved during {where}, so that the mean of the frames is no single view"
 
 
 def _unwrapped(frames: Frames) -> NDArray[np.float64]:

@@ -66,10 +66,19 @@ def _without_scale(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
 
 
 def _albedo_of(mesh: trimesh.Trimesh) -> float | NDArray[np.float64]:
-    """Return the luminance of a mesh's material, or of each face's colour."""
+    """Return the luminance of a mesh's material and of its texture on the mean, or of each face's colour."""
     visual: Any = mesh.visual
     luminance = np.array([0.2126, 0.7152, 0.0722])
     if visual.kind in ("face", "vertex"):
         return np.asarray(np.asarray(visual.face_colors, np.float64)[:, :3] @ luminance / 255)
-    colour = getattr(getattr(visual, "material", None), "main_color", None)
-    return 0.8 if colour is None else float(np.asarray(colour, np.float64)[:3] @ luminance / 255)
+    material = getattr(visual, "material", None)
+    texture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    colour: Any = getattr(material, "baseColorFactor" if hasattr(material, "baseColorFactor") else "main_color", None)
+    placeholder = [102, 102, 102, 255]  # trimesh's diffuse colour of a material that states none
+    if texture is not None and np.array_equal(np.ravel(colour), placeholder):
+        colour = None
+    if colour is None and texture is None:
+        return 0.8
+    own = 1.0 if colour is None else np.asarray(colour, np.float64)[:3] / 255
+    drawn = 1.0 if texture is None else np.asarray(texture.convert("RGB"), np.float64).mean(axis=(0, 1)) / 255
+    return float(np.broadcast_to(own * drawn, 3) @ luminance)

@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from phasemark import InputFileError
+from phasemark import InputFileError, UsageError
 from phasemark.render.rigid import composed
 from phasemark.render.scene.body import Body
 from phasemark.render.scene.mesh_files import bodies_of_trimesh, loaded_meshes
@@ -47,7 +47,7 @@ def links_of_urdf(path: Path, albedo: float | None) -> list[Body]:
     colours = {each.get("name", ""): each.find("color") for each in robot.iter("material") if len(each)}
     poses = _link_poses(robot, path)
     kind = "visual" if robot.find("link/visual") is not None else "collision"
-    bodies = []
+    bodies: list[Body] = []
     for link in robot.findall("link"):
         name, visuals = link.get("name", ""), []
         where = f"{path}: link '{name}'"
@@ -56,8 +56,17 @@ def links_of_urdf(path: Path, albedo: float | None) -> list[Body]:
             if own is None and material is not None:
                 colour = material.find("color") if len(material) else colours.get(material.get("name", ""))
                 if colour is not None:
-                    own = float(np.clip(_numbers(colour, "rgba", 4, where)[:3] @ _LUMINANCE, 0, 1))
-            visuals.append(replace(_shape(visual.find("geometry"), own, path, where), pose=_origin(visual, where)))
+                    rgba = _numbers(colour, "rgba", 4, where)
+                    own = float(np.clip(rgba[:3] @ _LUMINANCE, 0, 1))
+                    if rgba[3] == 0:  # it is not to be seen
+                        continue
+            try:
+                shape = _shape(visual.find("geometry"), own, path, where)
+            except UsageError as error:  # a size that cannot be
+                raise InputFileError(f"{where}: {error}") from None
+            visuals.append(replace(shape, pose=_origin(visual, where)))
+        if name in (body.name for body in bodies):
+            raise InputFileError(f"{where}: there is another link of this name")
         if visuals:
             bodies.append(replace(Body.joined(visuals, name), pose=poses[name]))
     if not bodies:
@@ -115,6 +124,8 @@ def _shape(geometry: ElementTree.Element | None, albedo: float | None, path: Pat
     file = _mesh_file(shape.get("filename", ""), path, where)
     whole = Body.joined(bodies_of_trimesh(loaded_meshes(file), albedo))
     scale, faces = _numbers(shape, "scale", 3, where, "1 1 1"), np.asarray(whole.mesh.faces)
+    if not scale.all():
+        raise InputFileError(f"{where}: scale of <mesh> must not be 0, got {scale}")
     faces = faces if scale.prod() > 0 else faces[:, ::-1]
     return replace(whole, mesh=trimesh.Trimesh(np.asarray(whole.mesh.vertices) * scale, faces, process=False))
 

@@ -22,7 +22,7 @@ from phasemark.render.bench.fit.boards import (
 )
 from phasemark.render.bench.fit.fitted_sensor import AmplitudeUnit, Findings, SensorFit
 from phasemark.render.bench.fit.light import fit_light, limit_contrast
-from phasemark.render.bench.fit.ranges import board_tilts, fit_offsets, fit_pixels, odd_pixels, pixel_offsets
+from phasemark.render.bench.fit.ranges import board_tilts, bowl, fit_offsets, fit_pixels, odd_pixels, pixel_offsets
 from phasemark.render.frames import Frames
 from phasemark.render.integral.rounding import with_error
 from phasemark.render.sensor.sensor import Sensor
@@ -40,6 +40,18 @@ def _check_tilt(data: BoardData, found: Findings) -> None:
         raise UsageError(f"{where}, which would be taken for offsets of pixels: set it square to the camera")
     if tilt_deg[k] > noted_deg:
         found.notes.append(f"{where[0].upper()}{where[1:]}: that is in the spread of the pixels' offsets.")
+
+
+def _refuse_other_quantity(data: BoardData) -> None:
+    """Refuse ranges that are z, and the other way round."""
+    slope, std = bowl(data)
+    most_off, most_std = 0.2, 0.1
+    if abs(abs(slope) - 1) < most_off and std < most_std:
+        told, right = ("range", "z") if slope < 0 else ("z", "range")
+        raise UsageError(
+            f"the board's ranges {'fall' if slope < 0 else 'rise'} towards the edges by what z and range differ:"
+            f" taken for {told}, they must be {right}. Is quantity=… right?"
+        )
 
 
 def fit_sensor(
@@ -125,8 +137,8 @@ def fit_sensor(
     if abs(correlation) > correlated_sigmas * correlation_error:
         found.notes.append(
             "Frames are not independent: the noise of a pixel correlates by "
-            f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time; "
-            "standard errors allow for it, σ may be too small."
+            f"{with_error(correlation, correlation_error)} from one frame to the next, as behind a filter in time, or "
+            "while something moved; standard errors allow for it, σ may be too small."
         )
     # the pixels that a flat field shows to be odd leave before anything is measured
     first = Findings()
@@ -134,6 +146,7 @@ def fit_sensor(
     odd = odd_pixels(data, pixel_offsets(data, first)[0])
     data = data.without(odd)
     fit_offsets(data, found)
+    _refuse_other_quantity(data)
     _check_tilt(data, found)
     offset, offset_error = fit_pixels(data, odd, found)
     fit_light(data, amplitude_unit, found)

@@ -172,6 +172,21 @@ def board_tilts(data: BoardData) -> tuple[Floats, Floats]:
     return angle, std
 
 
+def bowl(data: BoardData) -> tuple[float, float]:
+    """Return by how much ranges rise towards the edges, in differences between range and z, with the standard error.
+
+    It is 0 of a board; −1 where z is taken for range, and 1 where range is taken for z.
+    """
+    cosine = data.sensor.axis_cosine()[data.good]
+    error = data.used([one.mean for one in data.error_m])
+    rise = data.distance_m[:, None] * (1 / cosine - 1)
+    error, rise = (values - values.mean(axis=1, keepdims=True) for values in (error, rise))
+    least = np.finfo(float).tiny
+    slope = float((rise * error).sum() / max((rise**2).sum(), least))
+    variance = float(((error - slope * rise) ** 2).sum() / max((rise**2).sum(), least)) / max(rise.size - 1, 1)
+    return slope, math.sqrt(variance)
+
+
 def odd_pixels(data: BoardData, offset_m: Floats) -> NDArray[np.bool_]:
     """Return pixels that are stuck, far noisier than the rest at their light, or far off; (rows, cols)."""
     good = data.good
