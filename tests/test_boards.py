@@ -377,3 +377,39 @@ def test_a_log_of_100_megabytes_takes_less_than_2_gigabytes(tmp_path):
     assert n_frames == 100_000_000 // len(frame)
     print(f"{n_frames} frames, {kilobytes / 1e6:.2f} GB")
     assert kilobytes < 2e6
+
+
+def test_json_lines_state_their_unit_and_stamps_that_run_back_are_noted(tmp_path):
+    zones = images(8)
+    rows = [
+        {"distances": (frame.ravel() / 10).tolist(), "unit": "cm", "t_ms": time_ms}
+        for frame, time_ms in zip(zones, (100, 200, 0), strict=True)
+    ]
+    path = written(tmp_path, "\n".join(map(json.dumps, rows)))
+    with pytest.warns(UserWarning, match="1 of 3 time stamps run backwards, the first in frame 2"):
+        found = read_frames(path, sensor=SENSORS[8])
+    np.testing.assert_allclose(found.range_m[0], expected_range_m(zones, SENSORS[8]), rtol=1e-6)
+    with pytest.raises(InputFileError, match="holds no whole frame of board=json"):
+        read_frames(written(tmp_path, json.dumps({**rows[0], "unit": "inch"})), sensor=SENSORS[8])
+
+
+def test_captures_of_two_frames_make_no_frame(tmp_path):
+    zones = images(8, 4)
+    lines = log_of("tmf8828", zones).splitlines(keepends=True)
+    found = [k for k, line in enumerate(lines) if line.startswith("#Obj")]
+    text = "".join(
+        line for k, line in enumerate(lines) if k not in found[6:10]
+    )  # the end of one, the begin of the next
+    with pytest.warns(UserWarning, match=r"left out 1 of 3 frames.* behind result .*: captures of two frames"):
+        frames = read_frames(written(tmp_path, text), sensor=TMF)
+    np.testing.assert_allclose(frames.range_m[0], zones[[0, 3]] / 1000, rtol=1e-6)
+
+
+def test_a_line_that_is_lost_behind_the_distances_costs_its_frame_alone(tmp_path):
+    zones = images(8)
+    lines = log_of("adafruit-webserial", zones).splitlines(keepends=True)
+    codes = [k for k, line in enumerate(lines) if line.startswith("S:")]
+    text = "".join(line for k, line in enumerate(lines) if k not in (codes[1], codes[1] + 1))
+    with pytest.warns(UserWarning, match="left out 1 of 3 frames"):
+        found = read_frames(written(tmp_path, text), sensor=SENSORS[8])
+    np.testing.assert_allclose(found.range_m[0], expected_range_m(zones[[0, 2]], SENSORS[8]), rtol=1e-6)

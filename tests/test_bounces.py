@@ -310,6 +310,35 @@ def test_bounces_that_cannot_be_computed_are_refused(monkeypatch: pytest.MonkeyP
         )
 
 
+def test_light_bounces_off_shells_of_one_mesh_that_touch_as_off_bodies_apart() -> None:
+    bodies, sensor = _corner()
+    apart = SceneRenderer(Scene(bodies), sensor, bounces=2).phasors(np.eye(4))
+    corners = [trimesh.transform_points(body.mesh.vertices, body.pose) for body in bodies]
+    meshes = [trimesh.Trimesh(v, body.mesh.faces, process=False) for v, body in zip(corners, bodies, strict=True)]
+    albedo = np.concatenate([np.full(len(body.mesh.faces), body.albedo) for body in bodies])
+    concatenated: Any = trimesh.util.concatenate(meshes)
+    for one in (Body.joined(bodies), Body(concatenated, albedo)):
+        whole = SceneRenderer(Scene([replace(one, name="one")]), sensor, bounces=2)
+        found = whole.phasors(np.eye(4))
+        brightest = np.abs(apart.phasor).max()
+        np.testing.assert_allclose(found.phasor, apart.phasor, atol=6e-4 * brightest)  # twice the tolerance
+        powers = np.sum([image.phasor for image in whole.albedo_powers("one", np.eye(4))[1:]])
+        assert abs(powers) > 0  # the albedo of all its shells is free
+
+
+def test_a_plate_on_the_middle_of_a_floor_parts_the_light_on_it() -> None:
+    """A floor with a seam below the plate is cut there in any case."""
+    sensor = _corner()[1]
+    plate = Body.plane((0.3, 0.3), albedo=0.9, pose=_pose((1.2, 0.0, -0.25), (-1, 0, 0)), name="plate")
+    whole = [Body.plane((2, 2), albedo=0.4, pose=_pose((1.0, 0, -0.4)), name="floor")]
+    seam = [
+        Body.plane((length, 2), albedo=0.4, pose=_pose((x, 0, -0.4)), name=f"floor {x}")
+        for x, length in ((0.6, 1.2), (1.6, 0.8))
+    ]
+    one, two = (SceneRenderer(Scene([*floor, plate]), sensor, bounces=2).phasors(np.eye(4)) for floor in (whole, seam))
+    np.testing.assert_allclose(one.phasor, two.phasor, atol=3e-3 * np.abs(two.phasor).max())
+
+
 def test_light_bounces_off_the_union_of_joined_bodies(monkeypatch: pytest.MonkeyPatch) -> None:
     turned = trimesh.transformations.rotation_matrix(0.4, [0, 0, 1])
     turned[:3, 3] = 0.02, 0.05, 0.03

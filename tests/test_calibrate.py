@@ -27,6 +27,7 @@ from phasemark.matcher.calibration.pose_track import PoseTrack
 from phasemark.matcher.calibration.recording_fit import overdispersion_of
 from phasemark.matcher.calibration.still_fit import StillFit
 from phasemark.matcher.chi_squared import largest_costs, p_values_of
+from phasemark.matcher.commands.calibrate import _filtered
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.filters.stamps import stamp_jitter
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -384,6 +385,26 @@ def test_frames_of_one_file_go_to_the_poses_in_turn():
         frames_of_poses([frames], KnownPoses.polar([1.0, 1.2, 1.4], 0.0))
     with pytest.raises(UsageError, match="3 poses, but frames of 2 positions"):
         frames_of_poses([frames, frames], KnownPoses.polar([1.0, 1.2, 1.4], 0.0))
+    stamped = Frames(ranges, sensor=PMD, time_s=np.arange(70.0)[None])
+    for own, right in (([10.0, 50.0], True), ([0.0, 34.5], True), ([10.0, 20.0], False)):
+        dwelt = replace(poses, time_s=np.array(own))
+        if right:
+            assert [one.n_frames for one in frames_of_poses([stamped], dwelt)] == [35, 35]
+            continue
+        with pytest.raises(UsageError, match="pose 1: its stamp is among the frames of pose 0 if each has 35"):
+            frames_of_poses([stamped], dwelt)
+        assert len(frames_of_poses([stamped], replace(dwelt, frames=np.array([15, 55])))) == 2
+
+
+def test_a_camera_that_moved_at_a_still_pose_is_noted(capsys):
+    poses = some_poses(np.random.default_rng(71), 3)
+    ranges = 1 + np.random.default_rng(72).normal(0, 0.004, (3, 30, 16, 16))
+    still, pushed = Frames(ranges, sensor=PMD), ranges.copy()
+    pushed[1] += np.linspace(0, 0.06, 30)[:, None, None]
+    _filtered([still], [poses], "ranges", False)
+    assert "moved" not in capsys.readouterr().err
+    _filtered([Frames(pushed, sensor=PMD)], [poses], "ranges", False)
+    assert "the camera or the scene moved during 1 of 3 positions, the first being 1" in capsys.readouterr().err
 
 
 @pytest.fixture(scope="module")

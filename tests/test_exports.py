@@ -235,7 +235,7 @@ def test_bop_models_load_as_the_toolkit_loads_them(bop):
             np.testing.assert_allclose(np.reshape(turn, (4, 4))[3], [0, 0, 0, 1])
 
 
-def write_bag(folder, images):
+def write_bag(folder, images, encodings=("", "mono8", "16UC1", "", "32FC1")):
     """Write a bag of images: topic, stamp in nanoseconds and values, float32 metres or uint16 mm."""
     rosbags = pytest.importorskip("rosbags.rosbag2")
     from rosbags.typesys import Stores, get_typestore
@@ -252,7 +252,7 @@ def write_bag(folder, images):
             at = stamp(sec=time_ns // 10**9, nanosec=time_ns % 10**9)
             message = image(
                 header=header(stamp=at, frame_id="camera"), height=len(data), width=data.shape[1],
-                encoding="16UC1" if data.dtype == np.uint16 else "32FC1", is_bigendian=0, step=data.strides[0],
+                encoding=encodings[data.dtype.itemsize], is_bigendian=0, step=data.strides[0],
                 data=data.view(np.uint8).ravel(),
             )  # fmt: skip
             writer.write(links[topic], k * 10**6, store.serialize_cdr(message, "sensor_msgs/msg/Image"))
@@ -265,6 +265,21 @@ def test_a_bag_whose_images_are_millimetres_and_metres_is_refused(tmp_path):
     ]
     with pytest.raises(InputFileError, match="'/tof/depth' must hold images of one encoding, 16UC1"):
         read_frames(write_bag(tmp_path / "both", both), sensor=preset("vl53l5cx-8x8"), quantity="z")
+
+
+def test_depth_in_mono16_is_millimetres_beside_amplitudes_that_are_not_read(tmp_path):
+    images = [
+        (topic, k * 10**9, np.full((8, 8), 700 + k if kind is np.uint16 else 9, kind))
+        for k in range(2)
+        for topic, kind in (("/tof/depth", np.uint16), ("/camera/amplitude/image", np.uint8))
+    ]
+    bag = write_bag(tmp_path / "bag", images, ("", "mono8", "mono16"))
+    reading: Any = {"sensor": preset("vl53l5cx-8x8"), "topic": "/tof/depth"}
+    with pytest.warns(UserWarning, match="amplitudes in images of mono8: left out"):
+        found = read_frames(bag, quantity="range", **reading)
+    np.testing.assert_allclose(found.range_m[0, :, 0, 0], [0.7, 0.701])
+    with pytest.warns(UserWarning, match="left out"), pytest.raises(UsageError, match="does not say its quantity"):
+        read_frames(bag, **reading)
 
 
 def test_stamps_of_a_bag_are_read_and_amplitudes_belong_to_the_image_of_their_stamp(tmp_path):

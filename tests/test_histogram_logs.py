@@ -124,6 +124,11 @@ def test_several_targets_a_zone_are_read_with_their_status(tmp_path: Path) -> No
         ("mm_9_0\n1\n", "column 'mm_9_0' is beyond 9 zones"),
         ("mm_0_0,mm_1_0\n1\n", "frame 0 has 1 cells, the header 2"),
         ("mm_0_0\nx\n", "frame 0, column 'mm_0_0': 'x' is no number"),
+        ("mm_0_0,mm_3_0\n500,500\n", "has columns of 4 zones, but the sensor has 9"),
+        ("mm_8_0,mm_8_0\n500,500\n", "names the column 'mm_8_0' twice"),
+        ("mm_0_0,mm_8_0,status_8_0\n500,500,5\n", "has no 'status_0_0', but others"),
+        ("# unit=mm quantity=z\nmm_8_0\n500\n", "must have quantity=range, as the sensor reports it, got z"),
+        ("mm_8_0\n0.5\n", "every range is below 0.01 m; is its unit, mm, right"),
     ],
 )
 def test_tables_of_targets_that_cannot_be_are_refused(tmp_path: Path, text: str, message: str) -> None:

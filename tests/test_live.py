@@ -39,7 +39,7 @@ from phasemark.matcher.live.search_beside import SearchesInLine
 from phasemark.matcher.live.sources import SourceFault
 from phasemark.matcher.live.streams import Stream
 from phasemark.matcher.live.tracker import Located
-from phasemark.matcher.locate import Locator, read_rig_recording, recording_bytes, simulated_recording
+from phasemark.matcher.locate import Locator, Rig, read_rig_recording, recording_bytes, simulated_recording
 from phasemark.matcher.sequence import Estimate, FreeMotion, PoseEstimator, Standing
 from phasemark.render import Frames, Renderer, Views, capture, preset
 
@@ -611,6 +611,58 @@ def test_lines_of_a_rig_s_sensors_are_frames_and_unknown_or_silent_sensors_are_t
         with pytest.raises(UsageError, match=message):
             run(open_rig_source(board.on_terminal(), rig), _SlowLocator(0.0))
         board.unplug()
+
+
+def test_data_that_are_late_are_placed_by_the_odometry_or_told_as_late():
+    """A robot moves at 0.4 m/s and 0.5 rad/s, and its sensors show where it was 0.1 s ago."""
+    wall_map, rig, _, _ = rig_drive()
+    late = Rig(sensor=[{**one.model_dump(exclude_none=True), "delay_s": 0.1} for one in rig.sensor])
+    times: Any = 0.2 * np.arange(8)
+
+    def path(time_s):
+        yaw = 0.3 + 0.5 * time_s
+        return np.column_stack([1.4 + 0.8 * (np.sin(yaw) - np.sin(0.3)), 1.2 - 0.8 * (np.cos(yaw) - np.cos(0.3)), yaw])
+
+    seen = simulated_recording(wall_map, rig, path(times - 0.1), np.random.default_rng(6))
+    for odometry, aged_s in ((path(times), 0.0), (None, 0.1)):
+        drive = replace(seen, time_s=times[:, None], odometry=odometry)
+        tracker = MapTracker(Locator(wall_map, late), 0.5, 1.0)
+        found = [tracker.locate(drive.one(k), float(times[k])) for k in range(8)][1:]  # the first one has none before
+        assert all(one.estimate.accepted for one in found)
+        assert [one.aged_s for one in found] == pytest.approx([aged_s] * 7)
+        off = [one.estimate.pose - true for one, true in zip(found, path(times[1:] - aged_s), strict=True)]
+        std = [np.sqrt(np.diag(one.estimate.covariance)) for one in found]
+        assert np.abs(np.divide(off, std)).max() < 3.0  # 40 mm are three of them, in each frame
+        assert np.abs(np.mean(off, axis=0)[:2]).max() < 0.012
+
+
+def test_the_last_frame_of_a_stream_that_ends_is_read_whole_or_not(tmp_path):
+    _, rig, _, drive = rig_drive()
+    lines = list(rig_lines(drive, rig.names))
+    file = tmp_path / "lines"
+    for kept, end in ((lines, b""), (lines, b"\n"), (lines[:-1], b"\n")):
+        file.write_bytes(b"".join(kept).rstrip(b"\n") + end)
+        source = RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig)
+        frames: Any = [arrival.frames for arrival in source.frames()]
+        assert len(frames) == len(drive)
+        assert np.isnan(frames[-1].depth_m[0, 0, 3]).all() == (len(kept) < len(lines))
+
+
+def test_a_session_that_cannot_begin_leaves_the_files_of_its_sinks(tmp_path, capsys):
+    wall_map, rig, _, drive = rig_drive()
+    kept, new = tmp_path / "old.jsonl", tmp_path / "new.jsonl"
+    kept.write_text("poses\n")
+    for name, content in (("room.toml", wall_map.to_toml()), ("rig.toml", rig.to_toml())):
+        (tmp_path / name).write_text(content)
+    (tmp_path / "drive.npz").write_bytes(recording_bytes(drive, rig))
+    rig_words = ["--map", str(tmp_path / "room.toml"), "--rig", str(tmp_path / "rig.toml"), "--at-once"]
+    words = ["live", str(tmp_path / "drive.npz"), *rig_words]
+    for wrong in (["--to", "mavlink:nonsense"], ["--to", f"mcap:{tmp_path / 'log.mcap'}"]):
+        assert main([*words, "--force", "--to", f"jsonl:{kept}", *wrong]) == 2
+        assert main([*words, "--to", f"jsonl:{new}", *wrong]) == 2
+    assert main([*words, "--to", f"jsonl:{kept}"]) == 4
+    assert kept.read_text() == "poses\n"
+    assert not new.exists()
 
 
 def test_zones_of_another_mode_or_damaged_odometry_are_no_frames_and_a_strange_stream_is_told(tmp_path):

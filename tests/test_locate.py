@@ -334,6 +334,24 @@ def test_a_recording_is_read_as_it_was_written_and_its_faults_are_named(tmp_path
         read_rig_recording(file, rig)
 
 
+def test_a_yaw_that_wraps_is_no_jump_and_odometry_is_whole_or_refused(tmp_path):
+    one, rig = room(wall=[POST]), ring_rig(4)
+    turned = np.column_stack([np.zeros((12, 2)), np.linspace(0.0, 3.5, 12)])
+    times = 0.1 * np.arange(12)
+    recording = simulated_recording(one, rig, [[1.6, 1.4, 0.3]], np.random.default_rng(5), time_s=times, moved=turned)
+    file = tmp_path / "spin.npz"
+    file.write_bytes(recording_bytes(recording, rig))
+    arrays = dict(np.load(file))
+    yaw = arrays["odo_dyaw_rad"]
+    np.savez(file, **{**arrays, "odo_dyaw_rad": (yaw + np.pi) % (2 * np.pi) - np.pi})
+    again = read_rig_recording(file, rig)
+    assert again.notes == ("",)
+    assert_allclose(again.moved, recording.moved, atol=1e-9)
+    np.savez(file, **{name: values for name, values in arrays.items() if name != "odo_dx_m"})
+    with pytest.raises(InputFileError, match="must have an array 'odo_dx_m'"):
+        read_rig_recording(file, rig)
+
+
 def test_a_map_in_millimetres_is_refused_and_one_of_two_kilometres_takes_no_memory():
     with pytest.raises(UsageError, match=r"the map is 4000 m long, .* 4 m: are both in metres\?"):
         Locator(WallMap(walls_m=[[0, 0, 4000, 0], [4000, 0, 4000, 3000]]), ring_rig(2))

@@ -515,3 +515,49 @@ def test_a_bad_file_is_an_input_error_of_one_line(tmp_path, make, reason):
         read_frames(path, sensor=SMALL, **STATED)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+def test_a_header_of_pixel_numbers_is_no_frame(tmp_path):
+    rows = [",".join(f"{1000 + k + 64 * frame}" for k in range(64)) for frame in range(3)]
+    sensor = preset("vl53l5cx-8x8")
+    for first in (0, 1):
+        text = "\n".join([",".join(str(first + k) for k in range(64)), *rows])
+        frames = read_frames(csv_file(tmp_path, text), sensor=sensor, unit="mm", quantity="range")
+        assert frames.n_frames == 3
+        assert frames.range_m[0, :, 0, 0].tolist() == pytest.approx([1.0, 1.064, 1.128])
+
+
+def test_frames_that_repeat_the_one_before_are_noted_where_others_do_not(tmp_path):
+    rng = np.random.default_rng(4)
+    text = "\n".join(",".join(f"{value:.4f}" for value in rng.normal(1.0, 0.01, 6)) for _ in range(4))
+    each_twice = "\n".join(line for line in text.splitlines() for _ in range(2))
+    read_frames(csv_file(tmp_path, text), sensor=SMALL, **STATED)
+    with pytest.warns(
+        UserWarning, match="4 of 8 frames repeat the one before to the last digit, the first .* frame 1:"
+    ):
+        read_frames(csv_file(tmp_path, each_twice), sensor=SMALL, **STATED)
+
+
+@pytest.mark.parametrize("form", ["npz", "h5"])
+def test_arrays_under_names_that_are_not_read_are_named(tmp_path, form):
+    arrays: dict[str, Any] = {"range": IMAGE, "target_status": np.full(IMAGE.shape, 5), "truth_distance_m": np.ones(1)}
+    if form == "npz":
+        np.savez(tmp_path / "a.npz", unit=np.bytes_("m"), quantity="range", **arrays)
+        path = tmp_path / "a.npz"
+    else:
+        words = {"units": np.bytes_("m"), "quantity": np.bytes_("range")}
+        path = hdf5_file(tmp_path, arrays, {"range": words})
+    with pytest.warns(UserWarning, match="ignores the arrays target_status$"):
+        assert read_frames(path, sensor=SMALL).range_m[0, 0].tolist() == IMAGE.tolist()
+
+
+def test_packed_arrays_are_refused(tmp_path):
+    path = hdf5_file(tmp_path, {"range": IMAGE}, {"range": {"units": "m", "quantity": "range", "scale_factor": 0.25}})
+    with pytest.raises(InputFileError, match="'range' is packed"):
+        read_frames(path, sensor=SMALL)
+
+
+def test_a_unit_that_the_file_states_wrongly_is_not_asked_of_the_caller(tmp_path):
+    np.savez(tmp_path / "a.npz", range=IMAGE, unit="mm", quantity="range")
+    with pytest.raises(InputFileError, match=r"is its unit, mm, right\? All would fit with m \(multiplying by 1000\)"):
+        read_frames(tmp_path / "a.npz", sensor=SMALL)

@@ -140,6 +140,18 @@ def test_a_report_from_files(run, files, which):
     assert out.splitlines()[1].startswith("position (mm)")
 
 
+def test_stamps_in_both_files_are_compared_by_time_whatever_the_number_of_poses(run, files, tmp_path):
+    track = tmp_path / "of_30.csv"
+    rows = [f"{t},{1 + 0.05 * t:.6f},10.0" for t in np.linspace(-0.4, 3.1, 30)]
+    track.write_text("\n".join(["t_s,distance_m,delta_deg", *rows, ""]))
+    report = json.loads(run("pose", "report", files[0], track, "--json").out)
+    assert report["position_error_mm"]["mean"]["value"] == pytest.approx(2.0, abs=1e-3)
+    late = json.loads(run("pose", "report", files[0], track, "--delay", -0.1, "--json").out)
+    assert late["position_error_mm"]["mean"]["value"] == pytest.approx(7.0, abs=1e-3)
+    code, _, err = run("pose", "report", files[0], files[1], "--delay", 0.1)
+    assert (code, "--delay takes stamps (t_s) in both files" in err) == (2, True)
+
+
 def test_files_that_do_not_belong_together(run, files, tmp_path):
     short = tmp_path / "short.csv"
     short.write_text("distance_m,delta_deg\n1.0,10\n")

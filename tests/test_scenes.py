@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 from oracles.analytic_scenes import Array, Solid, light_of_ellipsoid, pixels
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from phasemark import InputFileError, UsageError
@@ -455,6 +456,26 @@ def test_each_face_may_have_its_albedo_and_what_is_open_is_seen_from_both_sides(
         assert abs(two.intensity.sum() / one.intensity.sum() - 1) < 1e-6
         assert two.intensity.max() / one.intensity.max() == pytest.approx(1.5, rel=1e-2)
     assert one.intensity[0, 8, 8] == pytest.approx(0.5, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("material", "albedo"),
+    [
+        ({"baseColorTexture": 255}, 1.0),
+        ({"baseColorTexture": 51, "baseColorFactor": [255, 255, 255, 255]}, 0.2),
+        ({"baseColorTexture": 255, "baseColorFactor": [51, 51, 51, 255]}, 0.2),
+        ({"roughnessFactor": 0.5}, 0.8),
+    ],
+)
+def test_a_texture_counts_with_its_mean_and_no_colour_is_the_usual_albedo(tmp_path, material, albedo):
+    box, grey = trimesh.creation.box((0.2, 0.2, 0.2)), material.get("baseColorTexture")
+    if grey is not None:
+        material = {**material, "baseColorTexture": Image.new("RGB", (4, 4), (grey, grey, grey))}
+    box.visual = trimesh.visual.TextureVisuals(
+        uv=np.zeros((8, 2)), material=trimesh.visual.material.PBRMaterial(**material)
+    )
+    trimesh.Scene(box).export(tmp_path / "scene.glb")
+    assert Scene.read(tmp_path / "scene.glb").bodies[0].albedo == pytest.approx(albedo)
 
 
 def test_a_file_with_materials_becomes_a_scene(tmp_path):

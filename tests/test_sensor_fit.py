@@ -231,6 +231,14 @@ def test_a_board_whose_distance_is_wrong_or_in_another_order_is_named(name, stat
         fit_sensor(boards, stated, base=camera, albedo=[0.8])
 
 
+@pytest.mark.parametrize(("power", "told", "right"), [(1, "range", "z"), (-1, "z", "range")])
+def test_z_and_range_that_are_exchanged_are_refused(power, told, right):
+    boards = [take(PMD, distance, amplitude=False, intensity=False) for distance in NEAR]
+    other = [Frames(one.range_m * PMD.axis_cosine() ** power, sensor=PMD) for one in boards]
+    with pytest.raises(UsageError, match=f"by what z and range differ: taken for {told}, they must be {right}"):
+        fit_sensor(other, NEAR, base=PMD, albedo=[0.8])
+
+
 # What one distance tells, and what is odd
 
 

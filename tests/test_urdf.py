@@ -44,6 +44,12 @@ def test_a_urdf_becomes_the_bodies_of_its_links(tmp_path):
     [
         ("<box size", "<blob size", "link 'base': geometry <blob> is unknown: there are box"),
         ('"package://arm/meshes/tip.stl"', '"tip.dae"', r"link 'arm': there is no mesh 'tip\.dae'"),
+        (".2 .2 .1", ".2 -.2 .1", "link 'base': 'size_m' must be 3 positive numbers"),
+        (
+            '<link name="arm">',
+            '<link name="base"/><link name="arm">',
+            "link 'base': there is another link of this name",
+        ),
         (".2 .2 .1", ".2 .2", "link 'base': size of <box> must be 3 numbers, got '.2 .2'"),
         ('<child link="arm"/>', '<child link="hand"/>', "joint 'j': joins 'hand', which is no link of the robot"),
         ('<child link="arm"/>', '<child link="base"/>', "form a ring"),

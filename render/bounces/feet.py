@@ -1,4 +1,4 @@
-"""Feet: surfaces cut along the outlines of the closed bodies that stand on them or run through them."""
+"""Feet: surfaces cut along the outlines of the bodies that stand on them or run through them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _TOUCH = 1e-7
 def cut_where_bodies_stand(
     triangles: NDArray[np.float64], face: NDArray[np.int64], topology: MeshTopology, lift_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Cut triangles along the outlines of closed bodies in their plane.
+    """Cut triangles along the outlines of other bodies in their plane.
 
     Parameters
     ----------
@@ -58,11 +58,11 @@ def _outlines(
     low: NDArray[np.float64],
     high: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Return where the plane normal · x = height cuts closed bodies other than the face's own, segments (s, 2, 3).
+    """Return where the plane normal · x = height cuts bodies other than the face's own, segments (s, 2, 3).
 
     Those outside a box are left out.
     """
-    others = np.flatnonzero(topology.closed & (topology.part != topology.part[face]))
+    others = np.flatnonzero(topology.part != topology.part[face])
     corners = topology.vertices[topology.faces[others]]
     above = corners @ normal - height
     cut = (above > 0).any(axis=1) & (above <= 0).any(axis=1)

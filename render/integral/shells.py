@@ -31,7 +31,7 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
         A union keeps albedo and quadric of each face, and numbers the shell that it was of. Part labels are lost; they
         follow from the height again.
     """
-    shells = _shells(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
+    shells = shells_of(mesh)
     if len(shells) < 2:
         return mesh
     if not _may_intersect(np.array([(points.min(axis=0), points.max(axis=0)) for points, _, _ in shells])):
@@ -67,8 +67,9 @@ def unite_shells(mesh: SurfaceMesh) -> SurfaceMesh:
     )
 
 
-def _shells(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> list[_Triangles]:
+def shells_of(mesh: SurfaceMesh) -> list[_Triangles]:
     """Split a mesh where no edge joins its faces: points, faces and their numbers; holes stay holes."""
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     label = component_labels(len(faces), _adjacent_faces(faces))
     if not label.any():
         return [(vertices, faces, np.arange(len(faces)))]

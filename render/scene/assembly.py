@@ -56,7 +56,7 @@ class Assembly:
 
     def __init__(self, bodies: Sequence[Body], intersector: str, *, solids: bool = True, crosses: bool = True) -> None:
         self._kind, self._bodies, self._crosses = intersector, bodies, crosses
-        self._facets: Assembly | None = None
+        self._facets: tuple[Assembly, NDArray[np.int64]] | None = None
         self._solids = _solids(bodies) if solids else [None] * len(bodies)
         self._own = _analysed(bodies, self._solids)
         self._shells = [
@@ -112,14 +112,17 @@ class Assembly:
             self._still = None
             self.intersector = self._intersectors()
 
-    def in_facets(self, whole: Sequence[Body], body2world: NDArray[np.float64]) -> Assembly:
-        """Return the bodies of which these may be parts as meshes, where they stand: parts that overlap are united."""
-        if len(whole) == len(self._bodies) and all(solid is None for solid in self._solids):
-            return self
+    def in_facets(self, whole: Sequence[Body], body2world: NDArray[np.float64]) -> tuple[Assembly, NDArray[np.int64]]:
+        """Return the shells of bodies, of which these may be parts, as meshes where they stand, and whose each is."""
         if self._facets is None:
-            self._facets = Assembly(whole, self._kind, solids=False)
-        self._facets.place(body2world)
-        return self._facets
+            shells = [body.shells() for body in whole]
+            owner = np.repeat(np.arange(len(whole)), [len(own) for own in shells])
+            same = len(owner) == len(whole) == len(self._bodies) and all(solid is None for solid in self._solids)
+            facets = self if same else Assembly([one for own in shells for one in own], self._kind, solids=False)
+            self._facets = facets, owner
+        facets, owner = self._facets
+        facets.place(body2world[owner])
+        return facets, owner
 
     def corners(self) -> NDArray[np.float64]:
         """Return the vertices of all bodies, where they stand, those of the meshes of solids too, (v, 3)."""

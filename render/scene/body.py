@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
+from phasemark.render.integral.shells import shells_of, unite_shells
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.rigid import composed, rigid_transforms
 from phasemark.render.scene.solids import Solid
@@ -214,6 +215,19 @@ class Body:
             albedo = self.albedo if isinstance(self.albedo, float) else _one_if_equal(self.albedo[begin:end])
             pieces.append(replace(part, albedo=albedo, name=self.name, smooth=self.smooth, **gloss))
         return pieces
+
+    def shells(self) -> list[Body]:
+        """Return the body in pieces that no edge joins, those that run through one another united; or itself."""
+        mesh = unite_shells(Surface.of(self))
+        shells = shells_of(mesh)
+        if len(shells) == 1:
+            return [self]
+        albedo = np.broadcast_to(mesh.face_attributes.get("albedo", self.albedo), len(mesh.faces))
+        return [
+            replace(self, mesh=trimesh.Trimesh(points, faces, process=False), albedo=_one_if_equal(albedo[number]),
+                    primitive=None, parts=())
+            for points, faces, number in shells
+        ]  # fmt: skip
 
     def named(self, name: str) -> Body:
         """Return the body under another name."""

@@ -234,8 +234,9 @@ class SceneRenderer:
                     own[pixels] = new
                 sums.state[which] = found.state
             if self.bounces:
-                mesh = assembly.in_facets(self.scene.bodies, placings[which[0]])
-                bounced.append((pixels, self._bounced(mesh, poses, [0.0, *columns_hz], free)))
+                mesh, owner = assembly.in_facets(self.scene.bodies, placings[which[0]])
+                of_shells = None if free is None else free[owner]
+                bounced.append((pixels, self._bounced(mesh, poses, [0.0, *columns_hz], of_shells)))
 
         self._for_each_placing(integrate, cameras, placings, background, workers)
         self.untrusted_pixels += int((powers[0].state == UNTRUSTED).sum())
