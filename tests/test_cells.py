@@ -97,6 +97,20 @@ def wrap_turn(angle):
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def test_some_rows_of_cells_cost_what_they_do_among_all_and_the_others_infinitely_much(prisms):
+    bank = prisms[6]
+    behind = Renderer(None, bank.sensor).render(1.0, background=WALL)
+    whole = CellBounds(bank, (1, 1), behind)
+    only = np.random.default_rng(12).random(whole.shape[:2]) < 0.3
+    some = CellBounds(bank, (1, 1), behind, only=only)
+    image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(1.0, 0.4, background=WALL)
+    frame = kalman_filter(capture(image, bank.sensor, rng=np.random.default_rng(13), n_frames=50))
+    seen = Evidence.from_frames(frame, "ranges").seen
+    expected = np.where(only[:, :, None], costs(whole, seen, 0, 1e4), np.inf)
+    assert np.isfinite(expected).any()
+    np.testing.assert_allclose(costs(some, seen, 0, 1e4), expected, rtol=1e-5)  # float32
+
+
 def test_a_limit_leaves_out_the_cells_above_it_and_no_other(prisms):
     bank = prisms[6]
     cells = CellBounds(bank, (1, 1), None)

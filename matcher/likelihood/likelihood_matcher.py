@@ -364,7 +364,13 @@ class LikelihoodMatcher:
             Background(floor_m=floor_m).check_behind(self._rendered.renderer(c).footprint, view)
 
     def _cells(
-        self, behind: PhasorImages | None, *, open_edges: bool = False, tilted: bool = False, workers: int = 1
+        self,
+        behind: PhasorImages | None,
+        *,
+        open_edges: bool = False,
+        tilted: bool = False,
+        only: NDArray[np.bool_] | None = None,
+        workers: int = 1,
     ) -> CellBounds:
         """Return the cells of the bank before some background, for level or for tilted frames."""
         setup, bank = self._setup, self._bank
@@ -376,6 +382,7 @@ class LikelihoodMatcher:
             upward=not setup.height_and_tilt_are_known or tilted,
             open_edges=open_edges,
             turned=self._turned if setup.bearing_is_free or tilted else None,
+            only=only,
             workers=workers,
         )
 
@@ -398,7 +405,7 @@ class LikelihoodMatcher:
 
     def _open_scene(self) -> Scene:
         """Return the scene without a background whose search leaves open whether there is one."""
-        return replace(self._scene, search=self._open_search, closed_search=lambda _: self._search)
+        return replace(self._scene, search=self._open_search, closed_search=lambda *_: self._search)
 
     def _scene_before(self, backgrounds: Sequence[Background]) -> Scene:
         """Return the scene of estimated backgrounds; see :class:`AutoBackground`."""
@@ -406,8 +413,8 @@ class LikelihoodMatcher:
             return self._scene
         behind = background_of(self._bank, *backgrounds)
 
-        def closed_search(k: int) -> Search:
-            return self._search.before(self._cells(background_of(self._bank, backgrounds[k])))
+        def closed_search(k: int, only: NDArray[np.bool_]) -> Search:
+            return self._search.before(self._cells(background_of(self._bank, backgrounds[k]), only=only))
 
         return replace(
             self._scene,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,7 +29,7 @@ from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import Candidates, costs_at, refine, slid
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene, Setup
-from phasemark.matcher.nearest.bank_minima import CostOf, Known, Search, Starts
+from phasemark.matcher.nearest.bank_minima import CostOf, Known, Starts
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD
 from phasemark.matcher.nearest.templates import Observation
@@ -144,7 +144,7 @@ def _with_rivals(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits
         cost_of = costs_on_scout(scene, evidence, which)
         starts = scene.search.of_frames(which).uncovered(seen[which], limit, places, cost_of, slack)
         if scene.closed_search is not None:
-            starts = _closed(scene.closed_search, evidence.seen, which, closed_limit, places, starts)
+            starts = _closed(scene, evidence.seen, which, closed_limit, places, starts)
         parts = [fits]
         for some in _in_parts(starts, len(which)):
             own = known[np.isin(known.frame, which[some])]
@@ -154,7 +154,7 @@ def _with_rivals(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits
 
 
 def _closed(
-    search_of: Callable[[int], Search],
+    scene: Scene,
     seen: Observation,
     which: NDArray[np.int64],
     limit: NDArray[np.float64],
@@ -162,11 +162,13 @@ def _closed(
     starts: Starts,
 ) -> Starts:
     """Return starts, those of frames with many of them from cells before their own backgrounds, all pixels compared."""
+    assert scene.closed_search is not None
     parts = [starts.of_frames(np.array([k])) for k in range(len(which))]
     many_starts = 30  # starts of a frame that take longer than cells before its own background
     for k in np.flatnonzero(np.bincount(starts.frame, minlength=len(which)) > many_starts):
         own = which[k : k + 1]
-        parts[k] = search_of(int(own[0])).uncovered(seen[own], limit[[k]], [places[int(k)]])
+        search = scene.closed_search(int(own[0]), scene.search.rows_of(parts[k]))
+        parts[k] = search.uncovered(seen[own], limit[[k]], [places[int(k)]])
     return Starts.joined(parts)
 
 

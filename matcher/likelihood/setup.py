@@ -119,7 +119,7 @@ class Scene:
         Minima of the bank.
     closed_search : callable, optional
         Returns the search of one frame, by its number, before what stands behind the landmark there, where that of all
-        leaves it open; None where it does not.
+        leaves it open, in some rows of cells at least, (class, D); None where it does not.
     """
 
     setup: Setup
@@ -127,7 +127,7 @@ class Scene:
     final: ImageModel
     scout: ImageModel | None
     search: Search
-    closed_search: Callable[[int], Search] | None = None
+    closed_search: Callable[[int, NDArray[np.bool_]], Search] | None = None
 
     @property
     def strips(self) -> StripModel | None:

@@ -262,6 +262,13 @@ class Search:
         order = np.argsort(costs, kind="stable")
         return Starts(np.zeros(len(order), np.int64), c, self._middles(b, i, j, f))[order]
 
+    def rows_of(self, starts: Starts) -> NDArray[np.bool_]:
+        """Return in which rows of cells, (class, D), those are that starts of :meth:`uncovered` stand for."""
+        reach_m = (_CLOSE[0] + 0.5) * first_step(self.cells.distance_m)
+        rows = np.zeros(self.cells.shape[:2], np.bool_)
+        np.logical_or.at(rows, starts.class_index, np.abs(self.cells.distance_m - starts.view[:, :1]) <= reach_m)
+        return rows
+
     def _close_to(self, c: int, view: NDArray[np.float64]) -> tuple[Any, ...]:
         """Return which cells of a class are close to a view, as an index of costs; whatever the elevation."""
         cells = self.cells

@@ -76,6 +76,8 @@ class CellBounds:
     turned : callable, optional
         Returns views at other bearings within half a column, for the centres of cells. Without it a column may show at
         those no more than it and its neighbours do, which is too little where columns are wide.
+    only : (class, distance) bool, optional
+        Which rows of cells are asked for; the others cost infinitely much. None: all.
     workers : int
         Threads in which cells are made.
 
@@ -99,8 +101,10 @@ class CellBounds:
         upward: bool = False,
         open_edges: bool = False,
         turned: Turned | None = None,
+        only: NDArray[np.bool_] | None = None,
         workers: int = 1,
     ) -> None:
+        self._only = only
         self.closes = closing_period(bank.delta_rad) is not None
         centres = (
             _centres(len(bank.distance_m), stride[0], False),
@@ -116,7 +120,7 @@ class CellBounds:
                 continue
             rows = group_rows(name, bank.sensor)
             seen = _Seen(behind, rows, open_edges, aside, upward)
-            found = _cells_of_group(bank, group, centres, stride, self.closes, seen, turned, workers)
+            found = _cells_of_group(bank, group, centres, stride, self.closes, seen, turned, only, workers)
             # pixels that differ most from cell to cell come first: a bound that grows early is given up early
             spread = [np.where(column < _FAR_M, column, 0).var() for column in found.middle_m.T]
             order = np.argsort(-np.array(spread), kind="stable")
@@ -157,6 +161,8 @@ class CellBounds:
             _everywhere(cells, *frame[1], period, np.float32(limit), everywhere)
             rest[:] = everywhere.T.reshape(rest.shape)
         _scan(self._blocks, self._pose[0], *frame[0], period, rest, np.float32(before), np.float32(limit), out)
+        if self._only is not None:
+            out[~self._only] = np.inf
 
 
 def _prepared(seen: Observation, pixels: NDArray[np.int64]) -> _Frame:
@@ -203,6 +209,7 @@ def _cells_of_group(
     closes: bool,
     seen: _Seen,
     turned: Turned | None,
+    only: NDArray[np.bool_] | None,
     workers: int,
 ) -> Cells:
     """Return the cells of a group of a bank, (class, D, δ, pixels) with all but the pixels flattened."""
@@ -216,7 +223,10 @@ def _cells_of_group(
     )
     n_class, n_a = len(bank.classes) if has_class else 1, len(centres[1]) if has_delta else 1
     shape = n_class * len(centres[0]) * n_a, (seen.rows[1] - seen.rows[0]) * cols
-    found = Cells(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+    found = Cells(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+    asked = np.ones((n_class, len(centres[0])), np.bool_)
+    if only is not None:
+        asked &= only if has_class else only.any(axis=0)
 
     def fill(k: int) -> None:
         c, at = divmod(k, len(centres[0]))
@@ -241,7 +251,7 @@ def _cells_of_group(
         place, packed = slice(k * n_a, (k + 1) * n_a), _packed(cells)
         found.middle_m[place], found.half_m[place], found.must_return[place] = packed
 
-    mapped(fill, range(n_class * len(centres[0])), workers)
+    mapped(fill, np.flatnonzero(asked).tolist(), workers)
     return found
 
 
