@@ -1,6 +1,7 @@
 """Accuracy at a glance: the card against the bound, its parts, the class error, the command."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -86,6 +87,15 @@ def test_class_distances_are_the_least_of_a_fine_grid(renderers):
     own = 25.0 * (~use & (image.coverage > 0.3)).sum()
     found = class_distances_squared(true, view, {"cone": other})[0, 0]
     assert found == pytest.approx(cost.min() - own, rel=0.02)  # the grid's steps
+
+
+def test_a_tilted_landmark_looks_like_itself_and_like_others_at_the_same_tilt(renderers):
+    true, other = renderers["cylinder"], renderers["sphere"]
+    level, tilted = Views.broadcast(2.0, [0.3, 1.0]), Views.broadcast(2.0, [0.3, 1.0], 0.0, 0.0, math.radians(2.0))
+    assert class_distances_squared(true, tilted, {"same": true}).max() < 1e-6
+    mounted = [one.seen_by(one.sensor.with_(pitch_deg=2.0)) for one in (true, other)]
+    expected = class_distances_squared(mounted[0], level, {"other": mounted[1]})
+    np.testing.assert_allclose(class_distances_squared(true, tilted, {"other": other}), expected, rtol=1e-6)
 
 
 def test_a_landmark_out_of_reach_is_said_to_be_not_observed(renderers):

@@ -113,6 +113,18 @@ def test_a_point_cloud_lies_on_the_pixels_rays(frames, tmp_path):
     np.testing.assert_allclose(cloud.vertices[:, 2] / cloud.vertices[:, 0], tangent * (1 - (rows + 0.5) / 8), atol=1e-6)
 
 
+def test_point_clouds_of_a_tilted_camera_are_level(tmp_path):
+    pitch = {"uniform": [5.0, 10.0]}
+    tilted = FramePlan(classes=["cone"], views=3, distance_m=1.0, floor_m=0.2, pitch_deg=pitch, roll_deg=4.0)
+    with build_frames(tilted, tmp_path / "frames.h5") as frames:
+        folder = export_frames(frames, tmp_path / "ply", "ply")
+    for number in range(3):
+        cloud: Any = trimesh.load(folder / f"{number:08d}.ply")
+        on_floor = cloud.vertices[:, 2] < -0.17  # below the cone
+        assert on_floor.sum() > 10
+        assert np.median(cloud.vertices[on_floor, 2]) == pytest.approx(-0.2, abs=4e-3)
+
+
 def read_json_file(path):
     """Load JSON as bop_toolkit does: keys that are numbers become numbers."""
 

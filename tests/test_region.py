@@ -252,6 +252,7 @@ def test_a_bank_of_a_region_describes_it(bank):
         ({"region": (0, 9, 0, 8), "binning": 4}, "the region's rows 0 … 9 do not make whole blocks of 4: end it at 8"),
         ({"binning": 20}, "'binning' must be at most 16, the image's size, got 20"),
         ({"binning": 0}, "'binning' must be greater than or equal to 1"),
+        ({"binning": 2, "sensor_overrides": {"fill_factor": [0.6, 0.8]}}, "'binning' takes pixels without gaps, got a"),
         ({"sensor": "vl53l5cx-8x8", "region": "landmark"}, "belong to phase cameras"),
         ({"region": "landmark", "sensor_overrides": {"pitch_deg": -40}}, "no landmark is in view at any distance"),
     ],

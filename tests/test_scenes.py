@@ -478,6 +478,12 @@ def test_a_texture_counts_with_its_mean_and_no_colour_is_the_usual_albedo(tmp_pa
     assert Scene.read(tmp_path / "scene.glb").bodies[0].albedo == pytest.approx(albedo)
 
 
+@pytest.mark.parametrize("field", ["bearing_offset_deg", "height_offset_m"])
+def test_where_a_sensor_points_from_its_mount_is_stated_by_the_pose_of_the_camera(field):
+    with pytest.raises(UsageError, match=f"'{field}' of the sensor is that before a landmark, got 0.05: a scene"):
+        SceneRenderer(Scene([Body.sphere(0.1)]), preset("pmd-16x16").with_(**{field: 0.05}))
+
+
 def test_a_file_with_materials_becomes_a_scene(tmp_path):
     loaded = trimesh.Scene()
     box = trimesh.creation.box((0.2, 0.2, 0.2))

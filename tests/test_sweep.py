@@ -19,7 +19,8 @@ from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
-from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder
+from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder, sweep_frames
+from phasemark.render import predicted_range_std
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
 
@@ -102,6 +103,37 @@ def test_rounds_go_on_until_the_rmse_is_known(tmp_path):
     for cell in trials.cells():
         for rmse in cell.rmse.values():
             assert rmse.high <= 1.1 * rmse.value or cell.n == 2000
+
+
+def test_strangers_are_tried_as_often_as_is_said_and_no_more_trials_than_the_most(tmp_path):
+    box = {"name": "bare-box", "box": {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}}
+    more = {"trials": 20, "until_percent": 10.0, "stranger_trials": 4, "spread": (0.01, 6.0)}
+    one = plan(**more, max_trials=60, strangers=[box], axes={"distance_m": [0.95], "n_frames": [3]})
+    trials = run_sweep(one, tmp_path / "a")
+    n = np.bincount(trials.condition)
+    assert n[0] > 20  # there was another round
+    assert n[1] == 4
+    with pytest.raises(UsageError, match="has trials 0 … 3 of a condition, got 4"):
+        sweep_frames(tmp_path / "a", 1, 4)
+    few = run_sweep(plan(**more, max_trials=7), tmp_path / "b")
+    assert (np.bincount(few.condition) == 7).all()
+
+
+def test_a_landmark_has_the_albedo_of_its_plan_where_it_is_no_axis():
+    dark = {"name": "dark", "box": {"length_m": 0.24, "width_m": 0.16, "height_m": 0.15}, "albedo": 0.2}
+    found = {one.class_name: one.albedo for one in plan(landmarks=[dark]).conditions()}
+    assert found == {"cone": 0.8, "dark": 0.2}
+    axes = {"distance_m": [0.95], "n_frames": [3], "albedo": [0.5]}
+    assert {one.albedo for one in plan(landmarks=[dark], axes=axes).conditions()} == {0.5}
+
+
+def test_the_noise_factor_multiplies_the_noise_of_any_camera():
+    overrides = {"ambient_e": 2e5, "dark_e": 300.0, "read_noise_e": 50.0}
+    axes = {"distance_m": [0.95], "n_frames": [3], "noise_factor": [1.0, 3.0]}
+    one = plan(sensor_overrides=overrides, axes=axes)
+    job = SweepJob(one, Round.first_of(one))
+    std = [predicted_range_std(0.5, 0.6, job.believed_sensor(number)) for number in range(2)]
+    assert std[1] / std[0] == pytest.approx(3.0, rel=1e-9)
 
 
 @pytest.mark.parametrize(

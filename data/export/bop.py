@@ -60,7 +60,7 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
             if image == 0:
                 if split in scenes:
                     scenes[split].finish()
-                kind = split if split in _SPLITS else f"train_{split}"
+                kind = split if split.startswith(_SPLITS) else f"train_{split}"
                 scenes[split] = _Scene(folder / kind / f"{scene:06d}")
             class_index = int(sample["class_index"][k])
             rotation, translation_m = _pose(frames, sample, k, centres[class_index])

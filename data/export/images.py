@@ -13,6 +13,8 @@ from PIL import Image, PngImagePlugin
 from phasemark.data.export.samples import blocks, quantity_m, truth_rows
 from phasemark.data.frames.frame_set_file import FrameSet
 from phasemark.data.measured.reading import RangeOrZ
+from phasemark.render.rigid import tilt2level
+from phasemark.render.view import VIEW_FIELDS
 
 FULL_SCALE = 65535
 
@@ -55,14 +57,16 @@ def write_png16(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
 
 def write_ply(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     """Write ``NNNNNNNN.ply`` for each frame: the valid pixels in the level camera frame (x forward, y left, z up)."""
-    directions = frames.sensor.pixel_directions().reshape(-1, 3)
+    mounted = frames.sensor.pixel_directions().reshape(-1, 3)
     rows, cols = np.indices((frames.sensor.rows, frames.sensor.cols)).reshape(2, -1)
     floats, counts = ("x", "y", "z", "range", "amplitude"), ("row", "col")
     fields = [*((name, "<f4") for name in floats), *((name, "<u2") for name in counts)]
     kinds = {"<f4": "float", "<u2": "ushort"}
     for start, sample in blocks(frames):
         amplitude = sample.get("amplitude_e", np.zeros_like(sample["range_m"]))
+        turns = tilt2level(*(sample.get(name, np.zeros(len(amplitude))) for name in VIEW_FIELDS[4:]))
         for k, (range_m, amplitude_e) in enumerate(zip(sample["range_m"], amplitude, strict=True)):
+            directions = mounted @ turns[k].T
             seen = np.isfinite(range_m).ravel()
             points = np.empty(int(seen.sum()), dtype=fields)
             xyz = directions[seen] * range_m.ravel()[seen, None].astype(float)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from phasemark.matcher.one_frequency import phases_of
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 from phasemark.render import Background, Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
+from phasemark.render.view import VIEW_FIELDS
 
 _STEP_M = 1e-4
 _SHIFT_M = np.arange(-0.04, 0.041, 0.02)
@@ -69,7 +70,7 @@ class Appearance:
         std = predicted_range_std(np.abs(s), image.intensity.reshape(n, -1), sensor)
         slopes = []
         for name in parameters:
-            columns = {key: getattr(views, key) for key in ("distance_m", "delta_rad", "bearing_rad", "height_m")}
+            columns = {key: getattr(views, key) for key in VIEW_FIELDS}
             ends = [phasors(Views(**{**columns, name: columns[name] + side * _STEP_M})) for side in (1, -1)]
             turn = (ends[0] - ends[1]) / (2 * _STEP_M)
             power = np.where(s != 0, np.abs(s) ** 2, 1.0)
@@ -179,13 +180,11 @@ def _as_another(
     n = len(views)
     starts = 2
     place = np.empty((n, starts, 2))
-    for same in np.unique(np.stack([views.distance_m, views.bearing_rad, views.height_m]), axis=1).T:
-        distance, bearing, height = same
-        members = np.flatnonzero(
-            (views.distance_m == distance) & (views.bearing_rad == bearing) & (views.height_m == height)
-        )
+    others = [getattr(views, key) for key in VIEW_FIELDS if key != "delta_rad"]
+    for distance, *rest in np.unique(others, axis=1).T:
+        members = np.flatnonzero((np.transpose(others) == [distance, *rest]).all(axis=1))
         shift, side = (grid.ravel() for grid in np.meshgrid(_SHIFT_M, _TURN_RAD, indexing="ij"))
-        grid = Views.broadcast(distance + shift, side, bearing, height)
+        grid = Views.broadcast(distance + shift, side, *rest)
         images = Appearance.of(other, grid, (), None, n_frames, background=background)
         for k in members:
             best = np.argsort(truth[k : k + 1].imitated_by(images)[0])[:starts]
@@ -193,7 +192,7 @@ def _as_another(
     whose = np.repeat(np.arange(n), starts)
 
     def seen_at(at: NDArray[np.float64], parameters: Sequence[str]) -> Appearance:
-        moved = Views.broadcast(at[:, 0], at[:, 1], views.bearing_rad[whose], views.height_m[whose])
+        moved = replace(views[whose], distance_m=at[:, 0], delta_rad=at[:, 1])
         return Appearance.of(other, moved, parameters, None, n_frames, background=background)
 
     def limited(at: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:

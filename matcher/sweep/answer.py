@@ -109,7 +109,7 @@ def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
     sensor = job.believed_sensor(number)
     period = delta_period_rad(mesh_symmetry(job.objects[condition.class_name].mesh))
     others = {
-        name: Renderer(job.objects[name].mesh, sensor, albedo=condition.albedo)
+        name: Renderer(job.objects[name].mesh, sensor, albedo=job.albedo_before(number, name))
         for name in job.class_names
         if name != condition.class_name
     }

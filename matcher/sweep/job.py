@@ -103,7 +103,8 @@ class Round:
     @classmethod
     def first_of(cls, plan: SweepPlan) -> Round:
         """Return the first round of a sweep: all conditions."""
-        return cls(0, tuple(range(len(plan.conditions()))), 0, plan.trials)
+        most = plan.max_trials if plan.until_percent is not None else None
+        return cls(0, tuple(range(len(plan.conditions()))), 0, min(plan.trials, most or plan.trials))
 
 
 class SweepJob:
@@ -249,8 +250,15 @@ class SweepJob:
 
     def believed_sensor(self, number: int) -> Sensor:
         """Return the camera as a method knows it: its noise, none of its errors."""
-        factor = self.all_conditions[number].noise_factor
-        return self.sensor.with_(signal_e=self.sensor.signal_e / factor**2)
+        factor, sensor = self.all_conditions[number].noise_factor, self.sensor
+        changes = {name: getattr(sensor, name) / factor**2 for name in ("signal_e", "ambient_e", "dark_e")}
+        changes["read_noise_e"] = sensor.read_noise_e / factor
+        return sensor.with_(**{name: value for name, value in changes.items() if value != getattr(sensor, name)})
+
+    def albedo_before(self, number: int, name: str) -> float:
+        """Return the albedo of another landmark under a condition."""
+        alike = (one for one in self.all_conditions if one.class_name == name)
+        return self.all_conditions[number].albedo if "albedo" in self.plan.axes else next(alike).albedo
 
     def true_sensor(self, number: int) -> Sensor:
         """Return the camera as it is."""

@@ -43,7 +43,8 @@ class Condition:
     delta_deg : float
         Viewing angle δ of the middle of the true views, degrees.
     noise_factor : float
-        Standard deviation of a range, relative to the sensor's: `signal_e` is divided by its square.
+        Standard deviation of a range, relative to the sensor's: all electrons are divided by its square, read noise by
+        itself.
     n_frames : int
         Number of frames that are averaged.
     bearing_deg : float
@@ -53,7 +54,7 @@ class Condition:
     pitch_deg, roll_deg : float
         True tilt of the camera's mount, degrees.
     albedo : float
-        The landmark's true albedo.
+        The landmark's true albedo; that of its plan where it is no axis.
     wall_m : float
         Distance of a wall behind the landmark, metres; 0: no wall.
     wiggling : float
@@ -334,7 +335,8 @@ class SweepPlan(ScenePlan):
             There are more than 100 000.
         """
         axes = {name: self.axes[name] for name in AXES if name in self.axes}
-        names = (*self.class_names, *(stranger.name for stranger in self.strangers))
+        own = {part.name: part.albedo for part in (*self.parts(), *self.strangers)}
+        names = tuple(own)
         if self.design == "sobol":
             points = self._sobol(axes)
         elif self.design == "star":
@@ -347,7 +349,7 @@ class SweepPlan(ScenePlan):
         return tuple(
             Condition(name, **{k: int(v) if k in _WHOLE else v for k, v in point.items()})  # type: ignore[arg-type]
             for name in names
-            for point in points
+            for point in ({"albedo": own[name], **point} for point in points)
         )
 
     def _sobol(self, axes: dict[str, tuple[float, ...]]) -> list[dict[str, float]]:

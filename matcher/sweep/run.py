@@ -181,9 +181,12 @@ def sweep_frames(folder: str | os.PathLike[str], condition: int, trial: int) -> 
     if not 0 <= condition < n:
         raise UsageError(f"{folder}: has conditions 0 … {n - 1}, got {condition}")
     most = (plan.until_percent is not None and plan.max_trials) or plan.trials
+    first = Round.first_of(plan)
+    if SweepJob(plan, first).is_stranger(condition):
+        most = min(plan.stranger_trials, first.trials)
     if not 0 <= trial < most:
         raise UsageError(f"{folder}: has trials 0 … {most - 1} of a condition, got {trial}")
-    job = SweepJob(plan, Round.first_of(plan))
+    job = SweepJob(plan, first)
     return job.raw_frames(condition, job.image(condition, job.views(condition, trial, trial + 1)), trial)
 
 
@@ -252,6 +255,7 @@ def _next_round(plan: SweepPlan, trials: SweepTrials, rounds: list[Round]) -> Ro
     open_ = {
         cell.number
         for cell in trials.cells()
+        if not cell.stranger
         for rmse in cell.rmse.values()
         if not (rmse.value == 0 or (rmse.low > 0 and math.log(rmse.high / rmse.value) <= allowed))
     }

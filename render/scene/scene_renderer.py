@@ -59,8 +59,8 @@ class SceneRenderer:
     Raises
     ------
     UsageError
-        The sensor's lamp is not described, the sensor counts histograms, which have no bounces, or `rays` is no whole
-        number from 1 to 100.
+        The sensor's lamp is not described, the sensor counts histograms, which have no bounces, `rays` is no whole
+        number from 1 to 100, or the sensor has an offset of bearing or height, which a scene has in poses.
 
     Examples
     --------
@@ -88,6 +88,12 @@ class SceneRenderer:
         if not isinstance(scene, Scene):
             raise UsageError(f"'scene' must be a Scene, got {type(scene).__name__}")
         refuse_no_sensor(sensor)
+        for name in ("bearing_offset_deg", "height_offset_m"):
+            if getattr(sensor, name):
+                raise UsageError(
+                    f"'{name}' of the sensor is that before a landmark, got {getattr(sensor, name):g}: a scene"
+                    " has it in 'camera2world'"
+                )
         self.scene = scene
         self.sensor = sensor
         self._harmonics = tuple(sensor.harmonic_orders if harmonics is None else harmonics)

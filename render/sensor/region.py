@@ -54,13 +54,16 @@ class Region(NamedTuple):
         Raises
         ------
         UsageError
-            It does not lie in the image, does not hold whole blocks, or belongs to a direct sensor.
+            It does not lie in the image, does not hold whole blocks, belongs to a direct sensor, or adds up pixels with
+            gaps between them.
         """
         if sensor.kind == "direct":
             raise UsageError("'region' and 'binning' belong to phase cameras: the zones of a direct sensor overlap")
         n = self.binning
         if not 1 <= n <= MOST_BINNING:
             raise UsageError(f"'binning' must be a whole number from 1 to {MOST_BINNING}, got {n!r}")
+        if n > 1 and tuple(sensor.fill_factor) != (1.0, 1.0):
+            raise UsageError(f"'binning' takes pixels without gaps, got a 'fill_factor' of {tuple(sensor.fill_factor)}")
         sides = (
             ("rows", self.first_row, self.stop_row, sensor.rows),
             ("columns", self.first_col, self.stop_col, sensor.cols),
@@ -167,7 +170,6 @@ def _added_up(sensor: Sensor, n: int) -> dict[str, Any]:
     area = n * n
     well = sensor.saturation_e
     return {
-        "fill_factor": tuple((n - 1 + fill) / n for fill in sensor.fill_factor),
         "signal_e": sensor.signal_e * area,
         "ambient_e": sensor.ambient_e * area,
         "dark_e": sensor.dark_e * area,
