@@ -154,6 +154,17 @@ def test_a_landmark_whose_noise_is_far_below_a_step_of_the_grid_is_still_one(ban
     assert all(one.class_probability["gear"] > 0.99 for one in matches)
 
 
+@pytest.mark.parametrize("name", ["gear", "box", "notched"])
+def test_a_view_beyond_the_distances_of_a_bank_is_not_accepted(bank, name):
+    rng = np.random.default_rng(8)
+    beyond = rng.uniform(0.015, 0.025, 30)  # a step is 0.02 m
+    distance = np.where(rng.random(30) < 0.5, 0.5 - beyond, 1.1 + beyond)
+    image = Renderer(bank.mesh(name), SENSOR).render(distance, rng.uniform(0, 2 * np.pi, 30))
+    found = Matcher(bank, "nearest").match(kalman_filter(capture(image, SENSOR, rng=rng, n_frames=5)))
+    assert not found.accepted.any()
+    assert "outside the bank" in set(found.reason)
+
+
 def test_an_end_of_the_angles_may_be_a_minimum_unless_they_close():
     cost = np.array([[1.0, 2.0, 3.0, 0.0]])
     assert _is_minimum(cost, closes=False).tolist() == [[True, False, False, True]]

@@ -138,6 +138,25 @@ def test_mirror_rivals_are_kept_apart_until_motion_decides():
     assert not any(one.accepted and abs(one.pose[2] - 0.3 - 0.02 * k) > 0.1 for k, one in enumerate(said))
 
 
+@pytest.mark.parametrize(
+    ("reason", "other", "used"),
+    [
+        ("ambiguous", Candidate("b", 1.05, 0.0, 1.0, 0.3), False),
+        ("ambiguous", Candidate("a", 1.0, 1.2, 1.0, 0.3), True),
+        ("undetermined", Candidate("a", 1.0, 1.2, 1.0, 0.3), False),
+        ("undetermined", Candidate("a", 1.01, 0.03, 1.0, 0.3), True),
+        ("undetermined", Candidate("b", 1.05, 0.0, 20.0, 1e-5), True),
+    ],
+)
+def test_a_refused_match_that_may_be_something_else_is_no_sighting(reason, other, used):
+    estimator = PoseEstimator(Standing(), FreeMotion(0.2, 0.2, 0.4, 0.4))
+    for _ in range(20):
+        estimator.move(Reading(0.0, 0.0, STEP_S))
+        assert estimator.see(match_of((1.0, 0.0, 0.0))).used
+    estimator.move(Reading(0.0, 0.0, STEP_S))
+    assert estimator.see(match_of((1.0, 0.0, 0.0), reason=reason, alternatives=(other,))).used == used
+
+
 def test_an_outlier_is_refused_and_a_robot_that_was_put_elsewhere_is_found_again():
     estimator = PoseEstimator(Standing(), FreeMotion(0.1, 0.1, 0.1, 0.1))
     for view in [(1.0, 0.2, 0.0)] * 5:

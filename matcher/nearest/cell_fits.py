@@ -35,11 +35,15 @@ Group = tuple[Templates, Observation, NDArray[np.int64]]
 
 
 class CellFits(NamedTuple):
-    """χ² of the best position in each of m cells, its degrees of freedom, and what to compare fits by; (m,) each."""
+    """χ² of the best position in each of m cells, its degrees of freedom, and what to compare fits by; (m,) each.
+
+    `offset`, (m, 2), is where the position would be if it could leave the cell: steps in distance and angle.
+    """
 
     chi2: NDArray[np.float64]
     dof: NDArray[np.int64]
     cost: NDArray[np.float64]
+    offset: NDArray[np.float64]
 
 
 def fit_cells(groups: Sequence[Group], frame: NDArray[np.int64]) -> CellFits:
@@ -71,7 +75,8 @@ def fit_cells(groups: Sequence[Group], frame: NDArray[np.int64]) -> CellFits:
     n = n_compared + n_disagree
     chi2 = np.where(places, residual, DISAGREEMENT * n_compared) + DISAGREEMENT * n_disagree
     cost = chi2 + np.where(places, 1.0, DISAGREEMENT) * n_undecided
-    return CellFits(chi2, np.maximum(n - 2, 0).astype(np.int64), cost)
+    offset = np.stack([by_distance, by_angle], axis=-1)
+    return CellFits(chi2, np.maximum(n - 2, 0).astype(np.int64), cost, offset)
 
 
 def follow_distance(templates: Templates, distance_m: NDArray[np.float64], angles: int) -> NDArray[np.bool_]:

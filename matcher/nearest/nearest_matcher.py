@@ -43,7 +43,7 @@ class _Found:
     """The nearest template of every class: (n, classes) arrays, and which class fits best, (n,).
 
     `i` and `j` index distance and angle, `chi2`, `dof` and `cost` are of the fit in the template's cell: a grid that is
-    coarse against the noise has no image near a frame.
+    coarse against the noise has no image near a frame. `offset`, (n, classes, 2), is where that fit leads to.
     """
 
     i: NDArray[np.int64]
@@ -51,6 +51,7 @@ class _Found:
     chi2: NDArray[np.float64]
     dof: NDArray[np.int64]
     cost: NDArray[np.float64]
+    offset: NDArray[np.float64]
     best: NDArray[np.int64]
 
     def __getitem__(self, index: _Index | int) -> _Found:
@@ -148,7 +149,8 @@ class NearestMatcher:
         frame, c = (index.ravel() for index in np.indices(i.shape))
         fits = self._cells(pose_seen, class_seen, frame, c, i.ravel(), j.ravel())
         cost = fits.cost.reshape(i.shape)
-        return _Found(i, j, fits.chi2.reshape(i.shape), fits.dof.reshape(i.shape), cost, np.argmin(cost, axis=1))
+        chi2, dof, offset = fits.chi2.reshape(i.shape), fits.dof.reshape(i.shape), fits.offset.reshape(*i.shape, 2)
+        return _Found(i, j, chi2, dof, cost, offset, np.argmin(cost, axis=1))
 
     def _nothing(self) -> Templates:
         """Return the one template of a scene without a landmark."""
@@ -272,6 +274,8 @@ class NearestMatcher:
             reason = "no landmark"
         elif p_value < self._false_alarm:
             reason = "poor fit"
+        elif self._is_outside(found):
+            reason = "outside the bank"
         return Match(
             class_name=best.class_name if is_landmark else None,
             accepted=not reason,
@@ -285,6 +289,16 @@ class NearestMatcher:
             symmetry=self._symmetry[best.class_name],
             reason=reason,
         )
+
+    def _is_outside(self, found: _Found) -> bool:
+        """Return whether the best fit of one frame leads more than half a step beyond an end of the grid."""
+        beyond = 0.5
+        ends = [(found.i, len(self._bank.distance_m), False), (found.j, len(self._bank.delta_rad), self._closes)]
+        for (index, n, closes), steps in zip(ends, found.offset[found.best], strict=True):
+            at = index[found.best]
+            if not closes and ((at == 0 and steps < -beyond) or (at == n - 1 and steps > beyond)):
+                return True
+        return False
 
     def _probabilities(self, cost: NDArray[np.float64], none_cost: float) -> dict[str, float]:
         """Weigh classes and "none" by exp(−cost / 2), as Gaussian residuals and equal priors have it.

@@ -12,7 +12,7 @@ from phasemark import UsageError
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match
 from phasemark.matcher.sequence.odometry import Reading
 from phasemark.matcher.sequence.pose_filter import POSE, Motion, PoseFilter, Sighting
-from phasemark.matcher.sequence.standing import Standing
+from phasemark.matcher.sequence.standing import Standing, is_open
 
 _USABLE = ("", "undetermined", "ambiguous")
 """Reasons of matches that measure a pose: what else is refused shows no landmark, or not where it is."""
@@ -171,7 +171,7 @@ class PoseEstimator:
     def see(self, match: Match | None) -> Estimate:
         """Take the match of a frame, or None where there is none, and return the pose at its time."""
         usable = match is not None and match.class_name is not None and match.covariance is not None
-        if match is not None and usable and match.reason in _USABLE:
+        if match is not None and usable and match.reason in _USABLE and not is_open(match):
             self._tracks = self._children(match)
             self._settle()
         else:

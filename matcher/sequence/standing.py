@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.match import Match
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Candidate, Match
 from phasemark.matcher.position.robot_pose import RobotPose, pose_jacobian, robot_poses
 from phasemark.matcher.sequence.planar import lens_pose, rotation, view_of
 from phasemark.matcher.sequence.pose_filter import Sighting
@@ -137,6 +137,26 @@ class Standing:
         root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
         noise = pose.covariance + _LEAST_VARIANCE * np.eye(3)
         return Sighting(at, noise, self._jacobian(match, pose) @ root, self.rows, log_share)
+
+
+def is_open(match: Match) -> bool:
+    """Return whether a refused match may show what its sightings do not: another class, or, undetermined, a far view.
+
+    Parameters
+    ----------
+    match : Match
+    """
+    if match.accepted:
+        return False
+    others = sum(one.weight for one in match.alternatives if one.class_name != match.class_name)
+    rivals = sum(one.weight for one in match.alternatives if one.class_name == match.class_name and _is_far(one, match))
+    return others > _LEAST_SHARE or (match.reason == "undetermined" and rivals > _LEAST_SHARE)
+
+
+def _is_far(one: Candidate, match: Match) -> bool:
+    """Return whether a candidate is beyond the tolerance from the view of a match."""
+    turn = math.remainder(one.delta_rad - match.delta_rad, math.tau / match.symmetry)
+    return abs(one.distance_m - match.distance_m) > TOLERANCE_M or abs(turn) > TOLERANCE_RAD
 
 
 def _explanations(match: Match) -> Iterator[tuple[Match, float]]:
