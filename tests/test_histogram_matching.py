@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,6 +27,7 @@ from scipy.stats import binom, chi2, kstest, poisson
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.direct_method import Measured
@@ -32,7 +35,7 @@ from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.cost_shape import lessened, points_about
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
-from phasemark.matcher.histograms.target_matcher import TargetMatcher
+from phasemark.matcher.histograms.target_matcher import TargetMatcher, _Fit
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Views, capture, preset
@@ -438,3 +441,37 @@ def test_the_table_states_its_size_before_it_is_made() -> None:
         direct = matcher_of(background, classes=("cone",))._direct
         assert isinstance(direct, HistogramMatcher)
         assert direct.table_bytes == sum(table.n_bytes for table in direct.tables)
+
+
+def star() -> trimesh.Trimesh:
+    """Return a prism whose base is a star with arms of different lengths."""
+    arms = np.array([0.15, 0.11, 0.13, 0.09, 0.12])
+    radius = np.column_stack([arms, np.full(5, 0.05)]).ravel()
+    turn = 2 * np.pi * np.arange(10) / 10
+    rim = np.column_stack([radius * np.cos(turn), radius * np.sin(turn)])
+    points = np.vstack([np.column_stack([rim, np.full(10, z)]) for z in (-0.1, 0.1)] + [[[0, 0, -0.1], [0, 0, 0.1]]])
+    k, after, one = np.arange(10), (np.arange(10) + 1) % 10, np.ones(10, np.int64)
+    faces = [(k, after, after + 10), (k, after + 10, k + 10), (after, k, 20 * one), (k + 10, after + 10, 21 * one)]
+    return trimesh.Trimesh(points, np.vstack([np.column_stack(each) for each in faces]))
+
+
+def test_the_search_in_targets_of_a_tenth_of_a_millimetre_finds_a_view_as_good_as_the_true_one(tmp_path: Path) -> None:
+    star().export(tmp_path / "star.stl")
+    mesh = MeshPlan(name="star", path=str(tmp_path / "star.stl"), unit="m")
+    grid = {"distance_m": "0.5:0.9:0.02", "delta_deg": "0:360:3"}
+    plan = BankPlan(meshes=(mesh,), sensor="tmf8820-3x3", layout="full", **grid)
+    rng, n = np.random.default_rng(41), 10
+    views = Views.broadcast(
+        rng.uniform(0.55, 0.85, n), rng.uniform(0, 2 * np.pi, n), rng.normal(0, math.radians(1.2), n)
+    )
+    with build_bank(plan, tmp_path / "bank.h5") as bank:
+        image = HistogramRenderer(bank.mesh("star"), bank.camera, albedo=0.8).render_views(views)
+        targets = capture(image, bank.camera, rng=rng, n_frames=4).targets
+        matcher: Any = Matcher(bank, "refine", on="targets")._direct
+        for k in range(n):
+            frame = matcher._reported(targets, k)
+            truth, found = np.array([getattr(views, name)[k] for name in VIEW_FIELDS]), matcher._match(frame)
+            view = np.array([getattr(found, name) for name in VIEW_FIELDS])
+            right = matcher._fit(_Fit(matcher, frame, 0, truth)).view
+            cost, least = (matcher._costs(frame, 0, one[None])[0] for one in (view, right))
+            assert cost < least + 2.0

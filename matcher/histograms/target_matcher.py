@@ -37,7 +37,7 @@ from phasemark.render.direct.view_signals import STEPS, views_about
 from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 
-_STARTS, _FIRST_STEPS, _FOLLOWED, _STEPS, _SHARES = 24, 2, 6, 6, (1.0, 0.3)
+_STARTS, _FIRST_STEPS, _SHARPENED, _FOLLOWED, _STEPS, _SHARES = 24, 2, 12, 6, 6, (1.0, 0.3)
 """Of 60 frames of five random parts a start led to the right hill on 58: one of the first 12."""
 _EVERY = 2  # targets are looked up at every second distance of the grid: a start may lie between them
 _APART_RAD = math.radians(5.0)
@@ -45,10 +45,15 @@ _APART_RAD = math.radians(5.0)
 _DONE = 0.01  # squared standard deviations
 _BLUR_M = (5e-3, 1e-3)
 """Fits begin with targets that are known no better than this: sigmas may be a tenth of a millimetre, and a target that
-is off by more than five of them has no slope."""
+is off by more than five of them has no slope. The best starts are fitted as they are, too: what is blurred hides narrow
+hills, and may lead away from one."""
 _LEAST_STD_M = 1e-5
 _BETTER_FITS, _BETTER = 2, 0.1
 """Where a view a few standard deviations aside of the best fit explains the targets better, a fit begins there."""
+_LOOKED_ABOUT, _WORTH_A_LOOK = 4, 4 * DISAGREEMENT
+"""How many hills are looked about, and by how much they may cost more than the best one."""
+_NEAR_M, _NEAR_RAD = 0.005, math.radians(1.0)
+"""Fits that are nearer to one another stand on one hill."""
 _NO_STEPS = np.empty(0)
 _WIDER = 6.0
 """Slopes of targets span this multiple of the steps of counts: estimates jump where the highest bin changes."""
@@ -128,6 +133,12 @@ class _Fit:
     def of(self, frame: Reported) -> _Fit:
         """Return the comparison of other targets at the same view."""
         return _Fit(self._matcher, frame, self.class_index, self.view)
+
+    def is_near(self, other: _Fit) -> bool:
+        """Return whether another view of the class is so near that both are one hill."""
+        turn = math.remainder(float(self.view[1] - other.view[1]), 2 * math.pi)
+        near = abs(float(self.view[0] - other.view[0])) < _NEAR_M and abs(turn) < _NEAR_RAD
+        return self.class_index == other.class_index and near
 
     def moved(self, step: NDArray[np.float64]) -> _Fit:
         """Return the comparison at a view a step away, within the limits."""
@@ -226,15 +237,22 @@ class TargetMatcher(DirectMatcher):
         if not len(frame.zone):
             return no_answer(self.rules)
         coarse, fine = (frame._replace(std_m=np.hypot(frame.std_m, blur_m)) for blur_m in _BLUR_M)
-        begun = [self._fit(_Fit(self, coarse, *start), _FIRST_STEPS) for start in self._starts(frame)]
+        starts = self._starts(frame)
+        begun = [self._fit(_Fit(self, coarse, *start), _FIRST_STEPS) for start in starts]
         begun.sort(key=lambda fit: fit.cost)
-        sharper = [self._fit(fit.of(fine), _FIRST_STEPS) for fit in begun[:_FOLLOWED]]
-        fits = [self._fit(fit.of(frame)) for fit in sharper]
-        best_index = int(np.argmin([fit.cost for fit in fits]))
-        fits[best_index] = self._lessened(frame, fits[best_index])
+        sharper = [self._fit(fit.of(fine), _FIRST_STEPS) for fit in begun[:_SHARPENED]]
+        sharper.sort(key=lambda fit: fit.cost)
+        fits = [self._fit(fit.of(frame)) for fit in sharper[:_FOLLOWED]]
+        fits += [self._fit(_Fit(self, frame, *start)) for start in starts[:_FOLLOWED]]
+        fits.sort(key=lambda fit: fit.cost)
+        apart = [fit for k, fit in enumerate(fits) if not any(fit.is_near(other) for other in fits[:k])]
+        likely = [fit for fit in apart[:_LOOKED_ABOUT] if fit.cost < fits[0].cost + _WORTH_A_LOOK]
+        fits = [self._lessened(frame, fit) for fit in likely] + [fit for fit in apart if fit not in likely]
         found = [Explanation(fit.class_index, fit.view, fit.cost, fit.information) for fit in fits]
-        found += [Explanation(fit.class_index, fit.view, fit.of(frame).cost, None) for fit in begun[_FOLLOWED:]]
-        best, compared = fits[best_index], fits[best_index].compared
+        left = (*sharper[_FOLLOWED:], *begun[_SHARPENED:])
+        found += [Explanation(fit.class_index, fit.view, fit.of(frame).cost, None) for fit in left]
+        best = min(fits, key=lambda fit: fit.cost)
+        compared = best.compared
         expected = max(frame.n_frames * self._false_targets, 0.05)
         dof = compared.n_compared - len(self.free)
         p_fit = float(special.chdtrc(dof, compared.chi2)) if dof > 0 else 0.0
