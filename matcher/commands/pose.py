@@ -84,10 +84,10 @@ def _truth_of(
         if len(positions) < len(found):
             twice = int(positions[counts > 1][0])
             raise UsageError(f"{estimates}: position {twice} has more than one estimate: give each once")
-    if true.time_s is None or found.time_s is None:
+    index = np.arange(len(found)) if found.index is None else found.index
+    if true.time_s is None or found.time_s is None or (not delay_s and _agree(found.time_s, true.time_s, index)):
         if delay_s:
             raise UsageError("--delay takes stamps (t_s) in both files")
-        index = np.arange(len(found)) if found.index is None else found.index
         if index.min() < 0 or index.max() >= len(true):
             raise UsageError(
                 f"{truth}: has {len(true)} poses, and {estimates} has an estimate of position {int(index.max())}:"
@@ -106,3 +106,11 @@ def _truth_of(
             f"{truth}: no estimate of {estimates} was taken between two of its poses: do the clocks agree?"
         )
     return rows, Views.broadcast(*track.at(at[rows])[0].T)
+
+
+def _agree(found_s: NDArray[np.float64], true_s: NDArray[np.float64], index: NDArray[np.int64]) -> bool:
+    """Return whether estimates have the stamps of the true poses at their positions."""
+    import numpy as np
+
+    inside = index.min() >= 0 and index.max() < len(true_s)
+    return bool(inside and np.allclose(true_s[index], found_s, rtol=0.0, atol=1e-3))
