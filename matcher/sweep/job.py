@@ -257,8 +257,9 @@ class SweepJob:
 
     def albedo_before(self, number: int, name: str) -> float:
         """Return the albedo of another landmark under a condition."""
-        alike = (one for one in self.all_conditions if one.class_name == name)
-        return self.all_conditions[number].albedo if "albedo" in self.plan.axes else next(alike).albedo
+        if "albedo" in self.plan.axes:
+            return self.all_conditions[number].albedo
+        return next(one.albedo for one in self.all_conditions if one.class_name == name)
 
     def true_sensor(self, number: int) -> Sensor:
         """Return the camera as it is."""
