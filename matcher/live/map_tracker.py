@@ -67,6 +67,8 @@ class MapTracker:
         )  # fmt: skip
         # a frame without odometry around it shows where the robot was when its sensors saw it
         aged_s = 0.0 if moves else float(self.locator.rig.numbers().delay_s.mean())
+        if aged_s and now is not None and self._prior is not None:  # the next step of the odometry begins later
+            self._prior = self._prior[0], self._prior[1] + np.diag((self._rates * aged_s) ** 2)
         return Located(estimate, None, None, expected and found.accepted, note=note, aged_s=aged_s)
 
     def warm(self) -> None:
