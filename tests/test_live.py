@@ -1,5 +1,6 @@
 """Live poses: a fake board behind a terminal or a port, faults of every kind, and sinks read by other processes."""
 
+import gc
 import io
 import json
 import math
@@ -368,8 +369,10 @@ def test_mavlink_is_decoded_in_another_process_with_its_covariance_in_order():
         sink = MavlinkSink("mavlink", f"udpout:127.0.0.1:{port}")
         for message in sink.messages(POSE, COVARIANCE, 12.5):
             sink._link.mav.send(message)
+        early = sink.messages(POSE, COVARIANCE, -0.05)  # a recording from 0 s on, of a sensor that is late
         rows = [json.loads(line) for line in reader.stdout.readlines()]
     sink.close()
+    assert (early[0].usec, early[1].time_usec) == (0, 0)
     assert [row["kind"] for row in rows] == ["VISION_POSITION_ESTIMATE", "ODOMETRY"]
     for row in rows:
         assert row["usec"] == 12_500_000
@@ -452,6 +455,26 @@ def test_a_foxglove_server_says_that_its_port_is_taken(bank):
         port = taken.getsockname()[1]
         with pytest.raises(UsageError, match="the port cannot be used"):
             open_sink(f"foxglove://127.0.0.1:{port}", bank.camera)
+
+
+def test_a_foxglove_server_has_topics_for_who_connects(bank):
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    sink = open_sink(f"foxglove://127.0.0.1:{port}", bank.camera)
+    gc.collect()
+    hello = (
+        f"GET / HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        "Sec-WebSocket-Key: MDEyMzQ1Njc4OWFiY2RlZg==\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Protocol: foxglove.sdk.v1\r\n\r\n"
+    )
+    topics = {b"/pose", b"/update", b"/status", b"/zones"}
+    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+        client.sendall(hello.encode())
+        said = b""
+        while not all(topic in said for topic in topics):
+            said += client.recv(1 << 16)  # which raises TimeoutError where a topic is missing
+    sink.close()
+    assert b'"advertise"' in said
 
 
 @pytest.mark.parametrize(

@@ -34,7 +34,7 @@ class FoxgloveSink(Sink):
         host, _, port = address.rpartition(":")
         if not host or not port.isdigit():
             raise UsageError(f"{name}: must be foxglove://HOST:PORT, as in foxglove://127.0.0.1:8765")
-        context = foxglove.Context()
+        self._context = context = foxglove.Context()  # its channels close when nobody holds it any more
         try:
             self._server = foxglove.start_server(name="phasemark", host=host, port=int(port), context=context)
         except (RuntimeError, OSError, OverflowError) as error:
@@ -47,7 +47,7 @@ class FoxgloveSink(Sink):
 
     def update(self, update: Update) -> None:
         """Send a pose, if it is accepted, and what is known."""
-        found, now = update.located.estimate, int(update.time_s * 1e9)
+        found, now = update.located.estimate, max(int(update.time_s * 1e9), 0)
         self._update.log(update.as_dict(), log_time=now)
         self._zones.log({"range_m": plain_rows(update.zones_m)}, log_time=now)
         if not update.reason and found.pose is not None:

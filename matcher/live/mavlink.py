@@ -66,7 +66,7 @@ class MavlinkSink(Sink):
         whole = planar_covariance(covariance) * np.outer(_TO_FRD, _TO_FRD)
         upper = whole[np.triu_indices(6)].tolist()
         x, y, yaw = float(pose[0]), -float(pose[1]), -float(pose[2])
-        microseconds = int(time_s * 1e6)
+        microseconds = max(int(time_s * 1e6), 0)  # a delay may put a pose before the first stamp
         own, none = self._mavlink, [math.nan] * 21
         position = own.MAVLink_vision_position_estimate_message(
             microseconds, x, y, 0.0, 0.0, 0.0, yaw, upper, self._resets
