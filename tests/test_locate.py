@@ -1,5 +1,6 @@
 """A robot among walls: depths of columns, fits of stops, what is accepted, files and their faults."""
 
+import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -283,6 +284,41 @@ def test_a_drive_is_followed_from_its_odometry_and_smoothing_makes_it_no_worse()
     again = smoothed(recording, answers, locator)
     assert not again[5].accepted
     assert np.hypot(*(again[5].pose - path[5])[:2]) < 0.2
+
+
+def test_stops_that_several_poses_explain_do_not_make_smoothed_poses_wrong():
+    """In a room of six equal boxes an undetermined stop may be at another box."""
+    walls = [[0, 0, 5, 0], [5, 0, 5, 4], [5, 4, 0, 4], [0, 4, 0, 0]]
+    boxes = [
+        {"x_m": x, "y_m": y, "yaw_deg": 25.0 * x + 10 * y, "size_m": [0.3, 0.3, 1.0]}
+        for x in (1.0, 2.5, 4.0)
+        for y in (1.0, 3.0)
+    ]
+    one, rig = WallMap(walls_m=walls, box=boxes), ring_rig(3)
+    accepted = 0
+    for seed in range(4):
+        rng = np.random.default_rng([31, seed])
+        path = free_poses(one, 1, rng)
+        while len(path) < 12:
+            free = free_poses(one, 40, rng)
+            near = free[np.hypot(*(free - path[-1]).T[:2]) < 0.9]
+            path = np.concatenate([path, near[:1]])
+        recording, locator = simulated_recording(one, rig, path, rng), Locator(one, rig)
+        for answer, true in zip(smoothed(recording, locator.locate(recording), locator), path, strict=True):
+            assert not answer.accepted or np.hypot(*(answer.pose - true)[:2]) < 0.1
+            accepted += answer.accepted
+    assert accepted > 0
+
+
+def test_an_answer_without_bounds_is_json_and_no_measurement():
+    """One sensor before a long wall tells nothing of the place along it."""
+    one, rig = WallMap(walls_m=[[0, 0, 40, 0]]), ring_rig(2)
+    path = np.array([[20.0, 1.0, -math.pi / 2], [20.1, 1.0, -math.pi / 2]])
+    recording, locator = simulated_recording(one, rig, path, np.random.default_rng(1)), Locator(one, rig)
+    answers = locator.locate(recording)
+    joined = smoothed(recording, answers, locator)
+    assert not any(answer.accepted for answer in joined)
+    json.dumps([answer.as_dict() for answer in [*answers, *joined]], allow_nan=False)
 
 
 def test_a_robot_that_is_not_where_it_is_expected_is_believed_at_the_second_stop():

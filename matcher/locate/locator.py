@@ -110,7 +110,7 @@ class LocatedPose:
     def as_dict(self) -> dict[str, Any]:
         """Return plain numbers, for JSON: metres and degrees, in the covariance too."""
         unit = np.array([1.0, 1.0, math.degrees(1.0)])
-        known = math.isfinite(self.x_m)
+        known, bounded = math.isfinite(self.x_m), bool(np.isfinite(self.covariance).all())
         tilt: dict[str, float] = {}
         if self.tilt is not None:
             height, pitch, roll = np.where([True, False, False], self.tilt[0], np.degrees(self.tilt[0])).tolist()
@@ -124,7 +124,7 @@ class LocatedPose:
             "x_m": self.x_m if known else None,
             "y_m": self.y_m if known else None,
             "yaw_deg": math.degrees(self.yaw_rad) if known else None,
-            "covariance": (self.covariance * np.outer(unit, unit)).tolist() if known else None,
+            "covariance": (self.covariance * np.outer(unit, unit)).tolist() if bounded else None,
             **tilt,
             "explained": self.explained,
             "observed": self.observed,

@@ -27,7 +27,8 @@ _MOST_STEPS = 10
 def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: Locator) -> list[LocatedPose]:
     """Return answers joined by the odometry between the stops of each robot.
 
-    What the frames of accepted and of undetermined stops speak for are measurements. A measurement that disagrees with
+    What the frames of accepted stops speak for are measurements, and of undetermined ones that no other pose explains
+    and that do tell each of x, y and yaw. A measurement that disagrees with
     the rest by χ² is left out. A stop that was ambiguous or explained poorly is located again with the poses around as
     its prior. An answer is accepted if its stop takes part and its pose is determined then.
 
@@ -56,7 +57,7 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
     for robot in np.unique(recording.robot):
         own = np.flatnonzero(recording.robot == robot)
         steps = np.array([relative_pose(odometry[a], odometry[b]) for a, b in pairwise(own)]).reshape(-1, 3)
-        used = np.array([found[k].accepted or found[k].reason == "undetermined" for k in own])
+        used = np.array([_is_measurement(found[k]) for k in own])
         if not used.any():
             continue
         poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
@@ -71,6 +72,14 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
             found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found
+
+
+def _is_measurement(answer: LocatedPose) -> bool:
+    """Return True if an answer speaks for one pose."""
+    if answer.accepted:
+        return True
+    alone = answer.reason == "undetermined" and len(answer.alternatives) <= 1
+    return alone and answer.evidence is not None and bool(np.isfinite(answer.evidence[1]).all())
 
 
 def _joined(was: LocatedPose, pose: _Float, covariance: _Float, agrees: bool, locator: Locator) -> LocatedPose:
