@@ -53,6 +53,26 @@ def test_a_rig_is_found_within_what_is_stated():
     assert abs(math.degrees(marker[2]) - 2.0) < 0.3  # 30 stops of 0.15° each, and of the sensors' mean yaw
 
 
+def test_a_rig_that_is_right_is_not_doubted_for_residuals_that_come_and_go():
+    for seed in range(4):
+        rng = np.random.default_rng([7, seed])
+        one, rig = room(), ring_rig(4)
+        poses = free_poses(one, 15, rng)
+        recording = simulated_recording(one, rig, poses, rng, time_s=np.arange(8) / 7.5, moved=TURN)
+        measured = poses + np.array([0.002, 0.002, math.radians(0.15)]) * rng.standard_normal(poses.shape)
+        assert calibrate_rig(rig, [recording], [one], [measured]).doubts == ()
+
+
+def test_one_sensor_of_eight_that_looks_elsewhere_is_named():
+    rng, one, rig = np.random.default_rng(8), room(), ring_rig(8)
+    turned = rig.sensor[2].model_copy(update={"yaw_deg": rig.sensor[2].yaw_deg + 180})
+    true = rig.model_copy(update={"sensor": (*rig.sensor[:2], turned, *rig.sensor[3:])})
+    poses = free_poses(one, 15, rng)
+    recording = simulated_recording(one, true, poses, rng, time_s=np.arange(8) / 7.5, moved=TURN)
+    found = calibrate_rig(rig, [recording], [one], [poses])
+    assert any(doubt.endswith("% of the columns of s2 are explained, 70 % are needed") for doubt in found.doubts)
+
+
 def test_walls_that_stand_elsewhere_are_found():
     _, assumed, one, recording, measured = recorded(seed=2)
     believed = one.model_copy(update={"std_m": 0.03}).with_walls_moved(np.array([0.02, *[0.0] * 6]))
