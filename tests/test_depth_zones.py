@@ -266,6 +266,8 @@ FACING = np.broadcast_to([0.0, 0.0, -1.0], (16, 16, 3))
         ({"depth_m": np.ones(16)}, r"shape \(H, W\) or \(n, H, W\), at least 8 pixels a side, got \(16,\)"),
         ({"depth_m": np.ones((16, 2))}, r"at least 8 pixels a side, got \(16, 2\)"),
         ({"depth_m": "far"}, "'depth_m' must be an array of floating-point numbers"),
+        ({"depth_m": np.full((16, 16), 900.0)}, "must be metres, and its median is 900: divide millimetres by 1000"),
+        ({"intrinsics": (0.8, 0.8, 0.5, 0.5)}, "must be in pixels, got fx = 0.8 and fy = 0.8: multiply by the image's"),
         ({"intrinsics": (-20.0, 20.0, 7.5, 7.5)}, "focal lengths above 0 pixels, got fx = -20 and fy = 20"),
         ({"intrinsics": (20.0, 20.0, 7.5)}, r"'intrinsics' must be \(fx, fy, cx, cy\) or"),
         ({"intrinsics": [[20, 1, 7.5], [0, 20, 7.5], [0, 0, 1]]}, r"'intrinsics' must be \(fx, fy, cx, cy\) or"),

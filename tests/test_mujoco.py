@@ -403,6 +403,14 @@ class Slider(gymnasium.Env):
         return self.observed(), 0.0, False, False, {}
 
 
+class Still(Slider):
+    """A wall that stands still."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=0, options=options)
+        return self.observed(), {}
+
+
 DICTIONARY = gymnasium.spaces.Dict({"place": gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)})
 
 
@@ -429,6 +437,14 @@ def test_every_episode_has_noise_of_its_own_and_a_seed_repeats_it():
     first, second, again = (env.reset(seed=seed)[0] for seed in (5, None, 5))
     assert np.array_equal(first, again)
     assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize(("options", "the_same"), [({}, False), ({"seed": 4}, True)])
+def test_environments_without_a_seed_have_noise_of_their_own(options, the_same):
+    readings = []
+    for _ in range(2):
+        readings.append(TofObservation(Still(), camera="tof", replace=True, **options).reset()[0])
+    assert np.array_equal(*readings) is the_same
 
 
 def test_a_zone_without_target_has_the_largest_distance():

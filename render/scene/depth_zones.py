@@ -340,7 +340,7 @@ def _depth_images(depth_m: ArrayLike) -> NDArray[np.float64]:
         )
     images = depth.reshape(-1, *depth.shape[-2:]).astype(np.float64)
     returns = images[np.isfinite(images) & (images > 0)]
-    farthest_m = 1000.0
+    farthest_m = 100.0  # most of an image farther away is beyond every sensor of zones
     if returns.size and (middle := float(np.median(returns))) > farthest_m:
         raise UsageError(f"'depth_m' must be metres, and its median is {middle:.4g}: divide millimetres by 1000")
     return images
@@ -359,6 +359,10 @@ def _camera_numbers(intrinsics: ArrayLike) -> tuple[float, float, float, float]:
     fx, fy, cx, cy = map(float, numbers)
     if not (fx > 0 and fy > 0):
         raise UsageError(f"'intrinsics' must have focal lengths above 0 pixels, got fx = {fx:g} and fy = {fy:g}")
+    if min(fx, fy) < 1:
+        raise UsageError(
+            f"'intrinsics' must be in pixels, got fx = {fx:g} and fy = {fy:g}: multiply by the image's width and height"
+        )
     return fx, fy, cx, cy
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from typing import Any, SupportsFloat
 
 import numpy as np
@@ -59,6 +60,7 @@ class TofObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Reco
         if model is None or not hasattr(env.unwrapped, "data"):
             raise UsageError(f"{env.unwrapped} has no 'model' and 'data' of MuJoCo")
         self.tof = TofSensor(model, sensor=sensor, **options)
+        self._has_seed = "seed" in options
         self.reading: TofReading | None = None
         """The last reading of the sensor."""
         self._key, self._replace = key, replace
@@ -77,9 +79,14 @@ class TofObservation(gymnasium.Wrapper[Any, Any, Any, Any], gymnasium.utils.Reco
             self.observation_space = gymnasium.spaces.Dict({"observation": inner, key: distances})
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """Reset the environment and the sensor; a seed is that of the sensor's noise too."""
+        """Reset the environment and the sensor; a seed is that of the sensor's noise too.
+
+        Without any seed the noise is that of no other environment.
+        """
         observation, info = self.env.reset(seed=seed, options=options)
-        self.tof.reset(seed)
+        of_noise = seed if seed is not None or self._has_seed else secrets.randbits(63)
+        self._has_seed = True
+        self.tof.reset(of_noise)
         return self._observed(observation), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
