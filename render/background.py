@@ -14,6 +14,8 @@ from phasemark import UsageError
 from phasemark.render.kernel import inner
 from phasemark.render.view import FARTHEST_M, Footprint, Views
 
+UNSTATED_ALBEDO_STD = 0.5
+"""How well a landmark's albedo is known beside that of wall and floor, as a share of it, where nobody states either."""
 BOUNCES = 4
 """Column of the number of bounces among the parameters of a background."""
 Bounces = int | Literal["all"]
@@ -51,6 +53,10 @@ class Background:
     floor_albedo_std : float
         How well the floor's albedo is known: where light bounces, matching estimates it with this prior, and has what
         is left in the covariance. Of 0.05 to 0.6: 0.33 ± 0.16.
+    albedo_ratio_std : float
+        How well the landmark's albedo is known beside that of wall and floor, as a share of it: a pixel that sees both
+        has the range of their mixture. Matching ranges estimates it with this prior, unless a sensor reports one
+        surface; on phasors it is free anyway. 0: as it is stated.
 
     Raises
     ------
@@ -64,6 +70,7 @@ class Background:
     floor_albedo: float = 0.5
     bounces: Bounces = 0
     floor_albedo_std: float = 0.0
+    albedo_ratio_std: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("wall_m", "floor_m"):
@@ -77,8 +84,10 @@ class Background:
             if not 0 <= value <= 1:
                 raise UsageError(f"'{name}' must be in [0, 1], got {value!r}")
         check_number_of_bounces(self.bounces)
-        if not (math.isfinite(self.floor_albedo_std) and self.floor_albedo_std >= 0):
-            raise UsageError(f"'floor_albedo_std' must be 0 or more, got {self.floor_albedo_std!r}")
+        for name in ("floor_albedo_std", "albedo_ratio_std"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise UsageError(f"'{name}' must be 0 or more, got {value!r}")
 
     @property
     def estimates_floor_albedo(self) -> bool:

@@ -154,6 +154,34 @@ def test_a_prism_is_never_accepted_a_face_off(prisms, sides, setting):
         assert np.abs(wrap_turn(np.array(told) - delta[k])).min() <= GROSS_RAD
 
 
+@pytest.fixture(scope="module")
+def knob(tmp_path_factory):
+    """A bank of a prism of 24 sides with a pointer, which looks alike from a third of all sides."""
+    folder, pointer = tmp_path_factory.mktemp("knob"), trimesh.creation.box((0.14, 0.03, 0.16))
+    pointer.apply_translation((0.07, 0, 0))
+    whole = trimesh.boolean.union([trimesh.creation.cylinder(0.08, 0.2, sections=24), pointer], engine="manifold")
+    whole.export(folder / "knob.stl")
+    mesh = MeshPlan(name="knob", path=str(folder / "knob.stl"), unit="m")
+    plan = BankPlan(
+        meshes=(mesh,), sensor="vl53l8cx-8x8", distance_m="0.5:0.75:0.01", delta_deg="0:357:3", layout="full"
+    )
+    with build_bank(plan, folder / "bank.h5") as bank:
+        yield bank
+
+
+def test_a_landmark_far_beyond_the_prior_of_its_bearing_is_matched_without_that(knob):
+    """Its rivals lie beyond the bearings that the prior searches, too."""
+    rng, n = np.random.default_rng(5), 12
+    side = np.radians(rng.uniform(8, 14, n)) * rng.choice([-1, 1], n)
+    views = Views.broadcast(rng.uniform(0.55, 0.72, n), np.radians(rng.uniform(-40, 40, n)), side)
+    image = Renderer(knob.mesh("knob"), knob.sensor).render_views(views)
+    matches = Matcher(knob, "refine").match(kalman_filter(capture(image, knob.sensor, rng=rng, n_frames=10)))
+    right = (np.abs(matches.distance_m - views.distance_m) <= GROSS_M) & (
+        np.abs(wrap_turn(matches.delta_rad - views.delta_rad)) <= GROSS_RAD
+    )
+    assert right[matches.accepted].all()
+
+
 def test_a_lens_in_a_corner_of_the_box_of_a_round_part_is_outside_it():
     can = Renderer(trimesh.creation.cylinder(0.15, 0.2), preset("pmd-16x16"))
     image = can.render(0.2, math.radians(45))  # the corner of the bounding box is at 0.212 m

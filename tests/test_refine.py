@@ -165,6 +165,23 @@ def test_before_a_wall_mixed_pixels_inform_and_the_error_is_that_bound(matcher_o
     assert median_deg < 0.06  # PHYSICS section 7: 0.03° at 1 m, and these go to 1.6 m
 
 
+@pytest.mark.parametrize("albedo", [0.56, 0.8])
+def test_before_a_wall_of_unknown_albedo_the_error_is_the_bound_with_it(matcher_of, albedo):
+    # N = 40: pixels that see both have ranges of a mixture that nobody stated
+    behind, dark = replace(WALL, albedo_ratio_std=0.5), Renderer(build_mesh(catalog()["cone"]), SENSOR, albedo=albedo)
+    setup = TrialSetup(background=behind)
+    matcher = matcher_of(free=VIEW[:2], background=behind)
+    trials = run_trials(matcher.match, dark, "cone", setup, 40, np.random.default_rng(2))
+    inner = trials.scaled[~trials.outlier]
+    assert len(inner) >= 38
+    assert np.sqrt((inner**2).mean()) < 1.05 + 3.3 / math.sqrt(4 * len(inner))
+    assert abs(trials.summary().nees.value - 1) < 3.3 / math.sqrt(len(inner))
+    assert trials.accepted.mean() > 0.85
+    if albedo != 0.8:  # as stated, they are refused
+        stated = matcher_of(free=VIEW[:2], background=WALL).match
+        assert not run_trials(stated, dark, "cone", setup, 10, np.random.default_rng(2)).accepted.any()
+
+
 def test_on_phasors_the_albedo_does_not_matter(bank, matcher_of):
     # 30 % darker than the bank has it; N = 30
     dark = Renderer(build_mesh(catalog()["cylinder"]), SENSOR, albedo=0.56)

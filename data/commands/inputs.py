@@ -145,10 +145,19 @@ def background_of(wall: float | None, floor: float | None, bounces: str = "0") -
     return Background(wall_m=wall, floor_m=floor, bounces="all" if bounces == "all" else int(bounces))
 
 
+def of_any_albedo(behind: Background | None) -> Background | None:
+    """Return a background whose albedos nobody states; one off which light bounces as it is."""
+    from phasemark.render.background import UNSTATED_ALBEDO_STD
+
+    if behind is None or behind.bounces:
+        return behind
+    return replace(behind, albedo_ratio_std=UNSTATED_ALBEDO_STD)
+
+
 def background_to_estimate(
     wall: float | None, floor: float | None, bounces: str, floor_albedo: float | None
 ) -> Background | None:
-    """Return the background that the options state; where light bounces, with a floor of any usual albedo, or its own.
+    """Return the background that the options state, of any albedo; with the floor's own, or any, where light bounces.
 
     Raises
     ------
@@ -159,7 +168,7 @@ def background_to_estimate(
         raise UsageError("--floor-albedo goes with --floor and --bounces: nothing else depends on it")
     behind = background_of(wall, floor, bounces)
     if behind is None or not behind.bounces:
-        return behind
+        return of_any_albedo(behind)
     if floor_albedo is not None:
         return replace(behind, floor_albedo=floor_albedo)
     return replace(behind, floor_albedo=0.33, floor_albedo_std=0.16)  # of floors that return 0.05 to 0.6

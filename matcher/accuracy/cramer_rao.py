@@ -118,8 +118,9 @@ def cramer_rao(
     background : Background, optional
         Wall and floor; nothing stands behind the landmark without it.
     nuisances : sequence of str, optional
-        Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, nothing on ranges. Of histograms
-        "wall_m" alone can be named, for brightness is unknown anyway.
+        Which of :data:`NUISANCES` are unknown too; None: the albedo on phasors, and on ranges where `background` has
+        an `albedo_ratio_std`, which is then known before. Of histograms "wall_m" alone can be named, for brightness is
+        unknown anyway.
     systematic : collection of {"calibration", "recording", "declared"}
         Which errors of the sensor that all frames share are added: what its calibration leaves, what differs in another
         recording, and what it declares.
@@ -171,7 +172,8 @@ def cramer_rao(
         raise UsageError(
             f"'on' must be 'ranges' or 'phasors', got {on!r}: a HistogramRenderer has the bound of histograms"
         )
-    nuisances = (("albedo",) if on == "phasors" else ()) if nuisances is None else tuple(nuisances)
+    known_std = background.albedo_ratio_std if on == "ranges" and background is not None else 0.0
+    nuisances = (("albedo",) if on == "phasors" or known_std else ()) if nuisances is None else tuple(nuisances)
     for name in nuisances:
         if name not in NUISANCES:
             raise UsageError(f"'nuisances' must be among {', '.join(NUISANCES)}, got {name!r}")
@@ -211,6 +213,9 @@ def cramer_rao(
     frames = np.broadcast_to(np.asarray(n_frames, np.float64), image.phasor.shape)
     rows = whitened_slopes(image.phasor, image.intensity, np.concatenate(columns, axis=1), use, frames, on, sensor)
     everything = rows @ rows.transpose(0, 2, 1)
+    if known_std and "albedo" in nuisances:
+        place = len(free) + nuisances.index("albedo")
+        everything[:, place, place] += known_std**-2.0
     information = eliminated(everything, len(free))
     common = None
     if chosen := check_systematic(systematic):

@@ -9,7 +9,14 @@ from typing import Annotated
 
 from phasemark.data.commands.command import Shown
 from phasemark.data.commands.console import echo, echo_json
-from phasemark.data.commands.inputs import ClassOrMesh, background_of, class_renderers, note_too_far, read_sensor
+from phasemark.data.commands.inputs import (
+    ClassOrMesh,
+    background_of,
+    class_renderers,
+    note_too_far,
+    of_any_albedo,
+    read_sensor,
+)
 from phasemark.data.commands.options import BouncesOfLight, Count, Degrees, Floor, Json, Metres, SensorName, Wall
 
 
@@ -55,7 +62,7 @@ def accuracy_line(
         symmetry = 1 if landmark.class_name is None else catalog()[landmark.class_name].symmetry
         views = sides_of(distance, delta_period_rad(symmetry))
     others = {other: one for other, one in class_renderers(camera).items() if other != landmark.class_name}
-    background = background_of(wall, floor, bounces)
+    background = of_any_albedo(background_of(wall, floor, bounces))
     card = accuracy_card(renderer, views, others=others, n_frames=n_frames, background=background)
     if as_json:
         return echo_json({"landmark": name, "sensor": sensor, "wall_m": wall, "floor_m": floor, **card.as_dict()})

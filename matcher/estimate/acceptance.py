@@ -56,6 +56,8 @@ class Rules:
         How much more than an answer a view far from it must cost: a single pixel must not decide between them.
     fewest_explained : int
         Returns that an answer must explain, where a fit may leave some out.
+    widest_rad : float
+        Bearing beyond which no rival is looked for.
     """
 
     names: tuple[str, ...]
@@ -68,6 +70,7 @@ class Rules:
     among_unknown: bool = False
     rival_cost: float = DISAGREEMENT
     fewest_explained: int = 0
+    widest_rad: float = math.inf
 
     @classmethod
     def of_bank(
@@ -137,7 +140,9 @@ def _explains_too_few(rules: Rules, fits: Fits, k: int) -> bool:
 
 
 def is_in_bank(rules: Rules, fits: Fits, k: int) -> bool:
-    """Return whether the view of a fit is in the range of the bank: beyond it no rival is looked for."""
+    """Return whether the view of a fit is where rivals are looked for: in the range of the bank and of bearings."""
+    if abs(fits.view[k, VIEW_FIELDS.index("bearing_rad")]) > rules.widest_rad:
+        return False
     period = delta_period_rad(rules.symmetry[fits.class_index[k]])
     return is_in_range(rules.distance_m, rules.delta_rad, fits.view[k], period)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -50,8 +51,11 @@ class DirectMatcher:
     ) -> None:  # fmt: skip
         self.sensor = bank.camera
         check_histogram_sensor(bank)
-        self.rules, self.free, self.workers = rules, rules.free, workers
+        self.free, self.workers = rules.free, workers
         self.prior_std = np.array(prior_std, dtype=np.float64)
+        beyond_tables = 1.5  # how much farther aside than the tables hills are followed
+        farthest_aside_rad = beyond_tables * max(self._bearings_rad)
+        self.rules = replace(rules, widest_rad=farthest_aside_rad) if farthest_aside_rad else rules
         self.prior_weight, self.columns = 1 / self.prior_std**2, [VIEW_FIELDS.index(name) for name in self.free]
         meshes = [bank.mesh(name) for name in bank.classes]
         self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]

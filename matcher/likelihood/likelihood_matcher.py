@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,6 +45,7 @@ from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, counts
 from phasemark.render import Background, PhasorImages, Renderer, Views
+from phasemark.render.background import UNSTATED_ALBEDO_STD
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.threads import mapped
 
@@ -64,6 +66,8 @@ _FEWEST_PER_PARAMETER, _FURTHER_ZONES = 6, 3
 surface each, that an answer explains beyond its number of free parameters."""
 _WALL_MOVES_M = 0.1
 """By how much a wall may be elsewhere than is expected of a frame that is tracked."""
+_ALBEDO_RATIOS = 0.5, 2.0
+"""Factors on a landmark's brightness beside the background's between which it is looked for where it is free."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 22
 """Of all frames that are matched together, times the square of the number of free parameters: every candidate has an
@@ -135,6 +139,7 @@ class LikelihoodMatcher:
             prior_std=prior if has_prior or min(prior) < math.inf else (),
             bearing_has_prior=has_prior,
             on=on,
+            albedo_std=self._albedo_std() if on == "ranges" and not reported else 0.0,
             unknown=unknown,
             reports_one_surface=reported,
             used=pixels_of(bank, pixels).ravel(),
@@ -143,18 +148,53 @@ class LikelihoodMatcher:
             policy=policy,
         )
         behind = background_of(bank, self._stated) if self._stated is not None else None
-        self._search = self._new_search(behind)
+        self._search = self._search_in(self._cells(behind, workers=self._workers))
         self._open_search = self._search.before(self._cells(None, open_edges=True)) if self._auto else self._search
-        self._exact, self._scout = self._bank_models(behind)
+        self._set_scene(behind)
         if self._auto or self._exact is None:
             self._check_distances()
         if self._stated is not None and self._stated.floor_m is not None and "height_m" not in self._setup.free:
             self._check_floor(self._stated.floor_m)
+
+    def _set_scene(self, behind: PhasorImages | None) -> None:
+        """Set what is searched and compared where all frames have the same background."""
+        self._exact, self._scout = self._bank_models(behind)
         final = self._exact or self._rendered
         self._scene = Scene(self._setup, behind, final, None if self._exact else self._scout, self._search)
 
     def match(self, frames: FilteredFrames) -> list[Match]:
-        """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number."""
+        """Match filtered frames, in threads of their own parts of them; the answers do not depend on their number.
+
+        A frame whose best view lies beyond the bearings that its prior has searched is matched again without one: there
+        may be rivals farther out.
+        """
+        answers = self._matched(frames)
+        if self._setup.bearing_is_free:
+            likely = [answer.accepted or answer.reason == "undetermined" for answer in answers]
+            bearing_rad = np.array([answer.bearing_rad for answer in answers], np.float64)
+            beyond = np.flatnonzero(np.array(likely) & (np.abs(bearing_rad) > self._setup.widest_rad))
+            if beyond.size:
+                for k, answer in zip(beyond, self._without_prior._matched(frames[beyond]), strict=True):
+                    answers[k] = answer
+        if "motion" not in self._systematic:
+            return answers
+        return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)
+
+    @cached_property
+    def _without_prior(self) -> LikelihoodMatcher:
+        """The same matcher with nothing known of the bearing, made when it is first needed."""
+        other, setup = copy.copy(self), self._setup
+        prior = tuple(
+            math.inf if name == "bearing_rad" else std for name, std in zip(setup.free, setup.prior_std, strict=True)
+        )
+        other._setup = replace(setup, prior_std=prior, bearing_has_prior=False, widest_rad=math.inf)
+        other.__dict__.pop("_search_of_tilted", None)
+        other._search, other._open_search = (other._search_in(one.cells) for one in (self._search, self._open_search))
+        other._set_scene(self._scene.behind)
+        return other
+
+    def _matched(self, frames: FilteredFrames) -> list[Match]:
+        """Match filtered frames, each alone."""
         match = self._match_auto if self._auto else self._match_stated
         tilted = frames.tilts_rad.any(axis=1)
         if tilted.any():
@@ -164,10 +204,13 @@ class LikelihoodMatcher:
         by_frame = {
             k: answer for part, some in zip(parts, found, strict=True) for k, answer in zip(part, some, strict=True)
         }
-        answers = [by_frame[k] for k in range(len(frames))]
-        if "motion" not in self._systematic:
-            return answers
-        return with_motion(self.free, frames.sensor.systematic_time_s, frames.time_s, answers)
+        return [by_frame[k] for k in range(len(frames))]
+
+    def _albedo_std(self) -> float:
+        """Return how well the landmark's albedo is known beside that of wall and floor."""
+        if self._auto:
+            return UNSTATED_ALBEDO_STD
+        return 0.0 if self._stated is None else self._stated.albedo_ratio_std
 
     @property
     def rules(self) -> Rules:
@@ -288,7 +331,8 @@ class LikelihoodMatcher:
     def _rendered(self) -> RenderedModel:
         """What renders the landmarks of the bank, made when it is first needed."""
         moves = set(self._setup.free) & {"bearing_rad", "pitch_rad", "roll_rad"}
-        splits = self._setup.on == "phasors" and (self._auto or self._stated is not None) and bool(moves)
+        fits_albedo = self._setup.on == "phasors" or self._setup.albedo_std > 0
+        splits = fits_albedo and (self._auto or self._stated is not None) and bool(moves)
         return RenderedModel(
             self._bank,
             self._stated,
@@ -383,19 +427,20 @@ class LikelihoodMatcher:
             open_edges=open_edges,
             turned=self._turned if setup.bearing_is_free or tilted else None,
             only=only,
+            ratios=_ALBEDO_RATIOS if setup.albedo_std > 0 and behind is not None else (),
             workers=workers,
         )
 
     @cached_property
     def _search_of_tilted(self) -> Search:
         """The search in frames whose tilt is known, made when it is first needed."""
-        return self._new_search(None, tilted=True)
+        return self._search_in(self._cells(None, tilted=True, workers=self._workers))
 
-    def _new_search(self, behind: PhasorImages | None, *, tilted: bool = False) -> Search:
-        """Return a search before some background, over all bearings that are looked for where they are free."""
+    def _search_in(self, cells: CellBounds) -> Search:
+        """Return a search in some cells, over all bearings that are looked for where they are free."""
         setup, layers = self._setup, layers_of(self._bank)
         return Search(
-            self._cells(behind, tilted=tilted, workers=self._workers),
+            cells,
             self._bank.sensor if layers is None else layers.camera,
             layers,
             setup.widest_rad if setup.bearing_is_free else 0.0,

@@ -23,7 +23,7 @@ LONGEST_STEP = 3.0
 """Longest step of a descent, in natural units of 1 cm and 1°."""
 
 ALBEDO = "albedo"
-"""Name of the factor on the landmark's brightness, profiled out on phasors."""
+"""Name of the factor on the landmark's brightness beside what stands behind it, profiled out."""
 ALBEDO_COLUMN = len(VIEW)
 """Its column in arrays of parameters, behind those of the view."""
 SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
@@ -64,6 +64,9 @@ class DescentSettings:
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
     around : ImageModel, optional
         What shows the views around a solution, where the images of the model itself are slow.
+    albedo_std : float
+        Standard deviation of the factor on the landmark's brightness, about 1, before the frame was seen; 0: it is 1.
+        On phasors nothing is known of it.
     policy : SearchPolicy
     """
 
@@ -77,6 +80,7 @@ class DescentSettings:
     unknown_around: bool = False
     longest_step: float = LONGEST_STEP
     around: ImageModel | None = None
+    albedo_std: float = 0.0
     policy: SearchPolicy = DEFAULT_POLICY
 
 
@@ -140,14 +144,15 @@ class Problem:
         self.model, self.evidence, self.settings = model.of_frames(frame), evidence, settings
         self.policy = settings.policy
         self.frame, self.class_index = frame, class_index
-        self.with_albedo = evidence.on == "phasors"
+        self.with_albedo = evidence.on == "phasors" or settings.albedo_std > 0
         names = (*settings.free, ALBEDO) if self.with_albedo else settings.free
         self.columns = np.array([(*VIEW, ALBEDO).index(name) for name in names])
         self.scale = np.array([SCALE[name] for name in names])
         self.height_or_tilt_is_free = bool(set(names) & set(VIEW[3:]))
         self.tilts = bool(set(names) & set(VIEW[TILT]))
         known = np.array(settings.prior_std) if settings.prior_std else np.full(len(settings.free), np.inf)
-        self.prior_weight = np.concatenate([known**-2.0, np.zeros(len(names) - len(known))])
+        of_albedo = settings.albedo_std**-2.0 if evidence.on == "ranges" and self.with_albedo else 0.0
+        self.prior_weight = np.concatenate([known**-2.0, np.full(len(names) - len(known), of_albedo)])
 
     def some(self, which: NDArray[np.integer], model: ImageModel | None = None) -> Problem:
         """Return the problem of some of the candidates, on the same or another model."""
@@ -168,7 +173,7 @@ class Problem:
         theta = self.parameters(view)
         view, free = np.ascontiguousarray(theta[:, :ALBEDO_COLUMN]), self.settings.free
         images = self.model.first_images(self.class_index, view, free)
-        if self.with_albedo:
+        if self.evidence.on == "phasors":
             theta[:, ALBEDO_COLUMN] = self._brightness(images)
         return self.summed(theta, self.pixels_at(images, theta), self.scaled(images, theta))
 
@@ -216,6 +221,7 @@ class Problem:
         """Return how far the free parameters are from what was expected of them, (m, p)."""
         expected = np.zeros((len(theta), ALBEDO_COLUMN + 1))
         expected[:, TILT] = self.evidence.tilt_rad[self.frame]
+        expected[:, ALBEDO_COLUMN] = 1.0
         return np.asarray((theta - expected)[:, self.columns])
 
     def with_prior(self, sums: Sums, theta: NDArray[np.float64]) -> Sums:
@@ -283,8 +289,8 @@ class Problem:
             that is smooth, which is then returned.
         """
         whole = change(self.model)
-        if whole is None:
-            return None
+        if whole is None or not self.with_albedo:
+            return whole
         alone = None if self.model.alone is None else change(self.model.alone)
         return whole * factor[:, None, None] if alone is None else whole + (factor[:, None, None] - 1) * alone
 

@@ -112,7 +112,8 @@ def costs_at(
     for _, some in _parts(starts, _VIEWS_AT_ONCE):
         problem = Problem(model, evidence, some.frame, some.class_index, settings)
         # on phasors the brightness of each has to be found first
-        there = problem.start(some.view) if problem.with_albedo else problem.at(problem.parameters(some.view))
+        on_phasors = evidence.on == "phasors"
+        there = problem.start(some.view) if on_phasors else problem.at(problem.parameters(some.view))
         costs.append(whole_cost(problem, there)[0])
     return np.concatenate(costs)
 
@@ -125,7 +126,7 @@ def slid(
     The ranges of all pixels grow as the distance does, and nothing else changes: good to `farthest_m`.
     """
     costs, views = [np.empty(0)], [np.empty((0, len(VIEW)))]
-    settings = replace(settings, free=VIEW[:1], prior_std=())
+    settings = replace(settings, free=VIEW[:1], prior_std=(), albedo_std=0.0)
     for _, some in _parts(starts, _VIEWS_AT_ONCE):
         problem = Problem(model, evidence, some.frame, some.class_index, settings)
         theta = problem.parameters(some.view)

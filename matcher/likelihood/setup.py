@@ -55,6 +55,8 @@ class Setup:
     bearing_has_prior : bool
         Whether the bearing is estimated with what is known of it.
     on : {"ranges", "phasors"}
+    albedo_std : float
+        How well the landmark's albedo is known beside that of what stands behind it, on ranges; 0: as it is stated.
     unknown : bool
         Whether unknown things may stand in view.
     reports_one_surface : bool
@@ -73,6 +75,7 @@ class Setup:
     prior_std: tuple[float, ...]
     bearing_has_prior: bool
     on: ResidualKind
+    albedo_std: float
     unknown: bool
     reports_one_surface: bool
     used: NDArray[np.bool_]
@@ -150,5 +153,6 @@ class Scene:
             unknown_around=setup.unknown,
             returns_behind=returns,
             around=self.strips,
+            albedo_std=0.0 if behind is None else setup.albedo_std,
             policy=setup.policy,
         )

@@ -127,7 +127,8 @@ def _carried(
         *(getattr(views, name) for name in VIEW),
         background=background, parameters=setup.free,
     )  # fmt: skip
-    if setup.on == "phasors":  # the albedo, which is fitted too, takes up part of an error
+    fits_albedo = setup.on == "phasors" or (setup.albedo_std > 0 and background is not None)
+    if fits_albedo:  # which takes up part of an error
         alone = image if background is None else renderer.render_views(views)
         slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
     by_fields = calibrated_slopes(renderer, sensor, views, image, background, fields_of(terms))
@@ -149,6 +150,8 @@ def _carried(
     p = len(setup.free)
     if setup.prior_std:
         information[:, :p, :p] += np.diag(np.array(setup.prior_std) ** -2.0)
+    if fits_albedo and setup.on == "ranges":
+        information[:, p, p] += setup.albedo_std**-2.0
     inverse = covariance_of(information, weak="none")
     carried = carried_covariances(inverse, rows, whitened(by_fields), terms)
     return {term: part[:, :p, :p] for term, part in carried.items()}

@@ -117,18 +117,17 @@ def slopes_around(
     """
     view = np.ascontiguousarray(state.theta[which, :ALBEDO_COLUMN])
     step = np.maximum(0.5 * std, _SLOPE_WIDTH * problem.scale[: std.shape[1]])
-    if not problem.with_albedo:
-        slope = problem.model.wide_slopes(problem.class_index, view, problem.settings.free, step)
-        if slope is None:
-            return None
-        # ignore pixels that are lit at one end of the step only: their phase slope is meaningless
-        phasor = np.abs(state.images.phasor[which])[:, None]
-        return np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
-    by_view = problem.at_brightness(
+    slope = problem.at_brightness(
         state.theta[which, ALBEDO_COLUMN],
         lambda model: model.wide_slopes(problem.class_index, view, problem.settings.free, step),
     )
-    return None if by_view is None else np.concatenate([by_view, state.images.slope[which, -1:]], axis=1)
+    if slope is None:
+        return None
+    if problem.evidence.on == "ranges":
+        # ignore pixels that are lit at one end of the step only: their phase slope is meaningless
+        phasor = np.abs(state.images.phasor[which])[:, None]
+        slope = np.where(np.abs(slope) * step[:, :, None] > phasor, 0.0, slope)
+    return np.concatenate([slope, state.images.slope[which, slope.shape[1] :]], axis=1)
 
 
 def slopes_along_axes(
@@ -148,13 +147,11 @@ def slopes_along_axes(
     factor = state.theta[which, ALBEDO_COLUMN]
     change = problem.at_brightness(factor, lambda model: model.differences(problem.class_index, view, moves))
     assert change is not None
-    if not problem.with_albedo:
+    if problem.evidence.on == "ranges":
         change = np.where(np.abs(change) > np.abs(state.images.phasor[which])[:, None], 0.0, change)
     # along the axes: slope · axis = change
     slope = np.asarray(np.einsum("mik,mkq->miq", vectors / length[:, None], change) / scale[:, None])
-    if not problem.with_albedo:
-        return slope
-    return np.concatenate([slope, state.images.slope[which, -1:]], axis=1)
+    return np.concatenate([slope, state.images.slope[which, p:]], axis=1)
 
 
 def step_of_others(

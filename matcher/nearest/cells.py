@@ -78,6 +78,8 @@ class CellBounds:
         those no more than it and its neighbours do, which is too little where columns are wide.
     only : (class, distance) bool, optional
         Which rows of cells are asked for; the others cost infinitely much. None: all.
+    ratios : sequence of float
+        Factors on the landmark's brightness beside the background's, between which it may lie, about 1.
     workers : int
         Threads in which cells are made.
 
@@ -102,6 +104,7 @@ class CellBounds:
         open_edges: bool = False,
         turned: Turned | None = None,
         only: NDArray[np.bool_] | None = None,
+        ratios: Sequence[float] = (),
         workers: int = 1,
     ) -> None:
         self._only = only
@@ -119,7 +122,7 @@ class CellBounds:
             if group is None:
                 continue
             rows = group_rows(name, bank.sensor)
-            seen = _Seen(behind, rows, open_edges, aside, upward)
+            seen = _Seen(behind, rows, open_edges, aside, upward, ratios)
             found = _cells_of_group(bank, group, centres, stride, self.closes, seen, turned, only, workers)
             # pixels that differ most from cell to cell come first: a bound that grows early is given up early
             spread = [np.where(column < _FAR_M, column, 0).var() for column in found.middle_m.T]
@@ -186,6 +189,7 @@ class _Seen(NamedTuple):
     open_edges: bool
     aside: bool
     upward: bool
+    ratios: Sequence[float]
 
 
 class _Intervals(NamedTuple):
@@ -271,7 +275,12 @@ def _intervals(
         half[edge] = farther_in * bank.sensor.pixel_rad * np.abs(ranges[edge])
     if seen.open_edges:
         half[edge], may = _FAR_M, may | edge
-    return _Intervals(ranges, half, may, must).each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))
+    found = [_Intervals(ranges, half, may, must)]
+    for ratio in seen.ratios:
+        other, *_ = seen_by_images(ratio * phasor, coverage, bank.sensor, seen.behind, seen.rows)
+        found.append(found[0]._replace(middle_m=other))
+    spanned = _span(found, bank.sensor.unambiguous_range_m) if seen.ratios else found[0]
+    return spanned.each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))
 
 
 def _hull(
