@@ -20,11 +20,12 @@ from phasemark.matcher.filters import noise_free
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.statistics import binomial_interval
 from phasemark.render import Background, PhasorImages, Renderer, Views, capture, preset
+from phasemark.render.background import UNSTATED_ALBEDO_STD
 
 pytestmark = pytest.mark.soak
 
 SENSOR = preset("pmd-16x16")
-WALL = Background(wall_m=4.0)
+WALL, OF_ANY_ALBEDO = Background(wall_m=4.0), Background(wall_m=4.0, albedo_ratio_std=UNSTATED_ALBEDO_STD)
 FIXED, BEARING = VIEW[:2], VIEW[:3]
 ROWS: dict[str, tuple[int, float, TrialSetup, dict[str, Any]]] = {
     "ranges": (5000, 1.05, TrialSetup(), {"free": FIXED}),
@@ -40,8 +41,14 @@ ROWS: dict[str, tuple[int, float, TrialSetup, dict[str, Any]]] = {
     "automatic wall": (
         1000,
         1.05,
-        TrialSetup(background=WALL, nuisances=("wall_m",)),
+        TrialSetup(background=OF_ANY_ALBEDO, nuisances=("wall_m", "albedo")),
         {"free": FIXED, "background": "auto"},
+    ),
+    "wall of any albedo": (
+        1000,
+        1.05,
+        TrialSetup(background=OF_ANY_ALBEDO),
+        {"free": FIXED, "background": OF_ANY_ALBEDO},
     ),
     "robust": (5000, 1.05, TrialSetup(), {"free": FIXED, "robust": True}),
 }

@@ -21,7 +21,6 @@ from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
 
-_WIDEST_BEARING_RAD = math.radians(4.0)
 _STEEPEST_RAD = math.radians(20.0)
 
 
@@ -43,7 +42,7 @@ class DirectMatcher:
         Threads; the answers do not depend on their number.
     """
 
-    _tables_aside = 1  # tables of a free bearing to either side
+    _bearing_step_rad = math.radians(4.0)  # between tables of a free bearing, at most
 
     def __init__(
         self, bank: Bank, *, prior_std: Sequence[float], rules: Rules,
@@ -53,9 +52,8 @@ class DirectMatcher:
         check_histogram_sensor(bank)
         self.free, self.workers = rules.free, workers
         self.prior_std = np.array(prior_std, dtype=np.float64)
-        beyond_tables = 1.5  # how much farther aside than the tables hills are followed
-        farthest_aside_rad = beyond_tables * max(self._bearings_rad)
-        self.rules = replace(rules, widest_rad=farthest_aside_rad) if farthest_aside_rad else rules
+        farthest_aside_rad = max(self._bearings_rad) + self._bearing_step_rad / 2  # beyond, rivals are in no table
+        self.rules = replace(rules, widest_rad=farthest_aside_rad)
         self.prior_weight, self.columns = 1 / self.prior_std**2, [VIEW_FIELDS.index(name) for name in self.free]
         meshes = [bank.mesh(name) for name in bank.classes]
         self.signals = [ViewSignals(mesh, self.sensor, float(mesh.metadata["albedo"])) for mesh in meshes]
@@ -77,8 +75,10 @@ class DirectMatcher:
         if "bearing_rad" not in self.free:
             return (0.0,)
         bearing_sigma = 2.0  # how far aside the tables of a free bearing reach
-        side = min(bearing_sigma * float(self.prior_std[self.free.index("bearing_rad")]), _WIDEST_BEARING_RAD)
-        aside = side / self._tables_aside * np.arange(1, self._tables_aside + 1)
+        quarter_image_rad = math.atan(self.sensor.tan_half_angles[0]) / 2
+        side = min(bearing_sigma * float(self.prior_std[self.free.index("bearing_rad")]), quarter_image_rad)
+        n_aside = math.ceil(side / self._bearing_step_rad - 1e-9)
+        aside = side / n_aside * np.arange(1, n_aside + 1)
         return (0.0, *(float(sign * bearing) for bearing in aside for sign in (-1, 1)))
 
     def _prior_of(self, bearing_rad: float) -> float:

@@ -153,7 +153,7 @@ class TargetMatcher(DirectMatcher):
     Albedos of a background are as stated, for targets do not tell them.
     """
 
-    _tables_aside = 2  # edges of zones are sharp: one standard deviation of the bearing apart
+    _bearing_step_rad = math.radians(2.0)  # edges of zones are sharp
 
     @property
     def table_bytes(self) -> int:
