@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.render import PhasorImages, Renderer, Sensor, Views, unwrap_ranges
+from phasemark.render.renderer import SplitImages
 from phasemark.render.sensor.frequencies import common_divisor_hz
 from phasemark.render.sensor.lens_fields import DERIVED
 
@@ -266,6 +267,12 @@ class OneFrequencyRenderer(Renderer):
         """Render views and their slopes."""
         seen, slope = self._renderer.render_with_slopes(views, *parameters, **options)
         return self._one.images(seen), self._one.slopes(seen, slope)
+
+    def render_split(self, views: Views, *parameters: Any, **options: Any) -> SplitImages:
+        """Render views and their slopes, and those of the landmark alone."""
+        seen, slope, alone, own = self._renderer.render_split(views, *parameters, **options)
+        one = self._one
+        return one.images(seen), one.slopes(seen, slope), one.images(alone), one.slopes(alone, own)
 
     def jacobian(self, *view: Any, **options: Any) -> NDArray[np.complex128]:
         """Return slopes by differences."""

@@ -19,6 +19,7 @@ from phasemark.render.background import BOUNCES, Background, Backgrounds, check_
 from phasemark.render.bounces.lamp import check_can_bounce
 from phasemark.render.derivative import VIEW_PARAMETERS, check_parameters, differentiate
 from phasemark.render.integral.area_integral import (
+    Alone,
     AreaIntegral,
     Slopes,
     Variant,
@@ -40,6 +41,8 @@ from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 if TYPE_CHECKING:
     from phasemark.render.bounces.standing import StandingLight
 
+SplitImages = tuple[PhasorImages, NDArray[np.complex128], PhasorImages, NDArray[np.complex128]]
+"""Images with their slopes, and the same of the landmark alone."""
 _TURNING = ("bearing_rad", "pitch_rad", "roll_rad")
 """Parameters that turn what stands behind the landmark."""
 _LARGE = 1 << 13
@@ -378,17 +381,59 @@ class Renderer:
         check_parameters(parameters)
         seen = views.in_camera(self.sensor)
         behind = self._checked(seen, background, workers)
-        whole, p = (0, self.sensor.rows), len(parameters)
-        m, shape = len(self.sensor.frequencies_hz), (self.sensor.rows, self.sensor.cols)
-        by_pixel = np.zeros((m, len(views) * math.prod(shape), p), np.complex128)
-        images = self._render(seen, behind, whole, workers, slope=by_pixel, parameters=parameters)
-        slope = by_pixel.reshape(m, len(views), *shape, p).transpose(1, 4, 0, 2, 3)
+        by_pixel = self._no_slopes(len(views), parameters)
+        images = self._render(seen, behind, (0, self.sensor.rows), workers, slope=by_pixel, parameters=parameters)
+        return replace(images, views=views), self._slopes(by_pixel, seen, behind, parameters, workers)
+
+    def render_split(self, views: Views, parameters: Sequence[str], *, background: Backgrounds) -> SplitImages:
+        """Render views with their slopes, and what the landmark alone returns in them, from the same samples.
+
+        Parameters are those of :meth:`render_with_slopes`; none may be named.
+
+        Returns
+        -------
+        images, slope
+            As :meth:`render_with_slopes` returns them.
+        alone, alone_slope
+            The same with nothing behind the landmark; intensities are those of the whole.
+        """
+        if parameters:
+            check_parameters(parameters)
+        seen = views.in_camera(self.sensor)
+        behind = self._checked(seen, background, 1)
+        by_pixel, alone = self._no_slopes(len(views), parameters), Alone(self._no_slopes(len(views), parameters))
+        whole = (0, self.sensor.rows)
+        images = self._render(seen, behind, whole, 1, slope=by_pixel, parameters=parameters, alone=alone)
+        assert alone.sums is not None
+        return (
+            replace(images, views=views),
+            self._slopes(by_pixel, seen, behind, parameters, 1),
+            replace(images_of_sums(alone.sums, self.sensor, self._integral.harmonics), views=views),
+            self._slopes(alone.slope_by_pixel, seen, np.zeros_like(behind), parameters, 1),
+        )
+
+    def _no_slopes(self, n: int, parameters: Sequence[str]) -> NDArray[np.complex128]:
+        """Return slopes to be filled, (m, pixels of n views, p)."""
+        sensor = self.sensor
+        return np.zeros((len(sensor.frequencies_hz), n * sensor.rows * sensor.cols, len(parameters)), np.complex128)
+
+    def _slopes(
+        self,
+        by_pixel: NDArray[np.complex128],
+        seen: Views,
+        behind: NDArray[np.float64],
+        parameters: Sequence[str],
+        workers: int,
+    ) -> NDArray[np.complex128]:
+        """Return slopes that were filled by view and parameter; by differences where edges are too many."""
+        m, _, p = by_pixel.shape
+        slope = by_pixel.reshape(m, len(seen), self.sensor.rows, self.sensor.cols, p).transpose(1, 4, 0, 2, 3)
         slope = slope[:, :, 0] if m == 1 else slope
         unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.split)
         full = np.flatnonzero(unknown)
-        if full.size:
+        if full.size and p:
             slope[full] = self._differences(seen[full], behind[full], parameters, workers)
-        return replace(images, views=views), slope
+        return slope
 
     def _differences(
         self, seen: Views, background: NDArray[np.float64], parameters: Sequence[str], workers: int
@@ -450,6 +495,7 @@ class Renderer:
         variant: Variant = "exact",
         slope: NDArray[np.complex128] | None = None,
         parameters: Sequence[str] = (),
+        alone: Alone | None = None,
     ) -> PhasorImages:
         """Render rows of views that have been checked, as the camera itself has them, before the rows of `background`.
 
@@ -463,7 +509,9 @@ class Renderer:
             turns = np.array([name in _TURNING for name in parameters], np.bool_) & bool(background[:, :2].any())
             slopes = Slopes(slope, partial(_motion, ordered, parameters), turns)
         poses = poses_of_views(ordered, behind, self.sensor.cam2level)
-        sums = self._integral.sums(poses, n_parts=_PARTS, rows=rows, workers=workers, variant=variant, slopes=slopes)
+        sums = self._integral.sums(
+            poses, n_parts=_PARTS, rows=rows, workers=workers, variant=variant, slopes=slopes, alone=alone
+        )
         untrusted = int((sums.state == UNTRUSTED).sum())
         with _COUNTING:
             self.untrusted_pixels += untrusted

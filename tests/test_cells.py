@@ -97,6 +97,22 @@ def wrap_turn(angle):
     return (angle + math.pi) % (2 * math.pi) - math.pi
 
 
+def test_bounds_hold_for_landmarks_of_any_albedo_between_ratios(prisms):
+    bank = prisms[6]
+    behind = Renderer(None, bank.sensor).render(1.0, background=WALL)
+    views = Views.broadcast(bank.distance_m[[10, 30]], bank.delta_rad[[20, 111]])
+    image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.5).render_views(views, background=WALL)
+    beyond_m = []
+    for ratios in ((), (0.5, 2.0)):
+        cells = CellBounds(bank, (1, 1), behind, ratios=ratios)
+        part, pixels = cells._pose
+        of = [i * len(cells.delta_rad) + j for i, j in ((10, 20), (30, 111))]
+        ranges = image.range_m.reshape(2, -1)[:, pixels]
+        off = np.abs(wrap_difference_m(ranges - part.middle_m[of].astype(float), bank.sensor)) - part.half_m[of]
+        beyond_m.append(np.nanmax(np.where(part.half_m[of] < 1e3, off, np.nan)))
+    assert beyond_m[1] < 1e-3 < 0.01 < beyond_m[0]
+
+
 def test_some_rows_of_cells_cost_what_they_do_among_all_and_the_others_infinitely_much(prisms):
     bank = prisms[6]
     behind = Renderer(None, bank.sensor).render(1.0, background=WALL)

@@ -202,6 +202,23 @@ def test_slopes_are_those_of_differences_of_images(name, background):
     assert error.max() < 0.08
 
 
+@pytest.mark.parametrize("name", ["cone", "sphere"])
+def test_what_a_landmark_returns_alone_is_split_from_what_stands_behind_it(name):
+    views = Views.broadcast([1.0, 1.2, 1.4], [0.1, 2.0, 4.0], [0.05, -0.1, 0.0], [0.0, 0.01, -0.02], [0.0, 0.03, 0.1])
+    behind = [Background(wall_m=2.5), Background(wall_m=3.0, floor_m=0.4), None]
+    renderer, names = (
+        Renderer(build_mesh(catalog()[name]), PMD),
+        ("distance_m", "delta_rad", "bearing_rad", "pitch_rad"),
+    )
+    images, slope, alone, alone_slope = renderer.render_split(views, names, background=behind)
+    whole, whole_slope = renderer.render_with_slopes(views, names, background=behind)
+    expected, expected_slope = renderer.render_with_slopes(views, names)
+    np.testing.assert_array_equal(images.phasor, whole.phasor)
+    np.testing.assert_array_equal(slope, whole_slope)
+    np.testing.assert_allclose(alone.phasor, expected.phasor, atol=1e-12 * np.abs(expected.phasor).max())
+    np.testing.assert_allclose(alone_slope, expected_slope, atol=1e-6 * np.abs(expected_slope).max())
+
+
 def test_open_meshes_get_differences_of_images():
     renderer, view = Renderer(SHEET, PMD), (1.0, 0.3, 0.01, 0.02)
     np.testing.assert_array_equal(with_images(renderer, *view), by_differences(renderer, *view))

@@ -19,6 +19,7 @@ from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.background import Backgrounds
 from phasemark.render.direct.chip_renderer import ChipRenderer
+from phasemark.render.renderer import SplitImages
 from phasemark.render.view import Footprint
 
 STEP = 1e-5
@@ -38,8 +39,8 @@ class RenderedModel(ImageModel):
     cache_bytes : int
         Room for images that other frames may start from too.
     splits_light : bool
-        Whether images know what of their phasors comes from the background, which takes a second rendering of each:
-        it depends on the bearing and the tilt of the view.
+        Whether images know what of their phasors comes from the background: it depends on the bearing and the tilt of
+        the view.
     reported : bool
         Whether ranges are those that the chip of a direct sensor reports.
     """
@@ -131,36 +132,37 @@ class RenderedModel(ImageModel):
         Height has one-sided slopes at 0, where the top of the lower part appears: it is differenced over 1e-5 m.
         """
         m, pixels, p = len(view), self.sensor.rows * self.sensor.cols, len(free)
+        splits = self.alone is not None
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
+        own_phasor, own_slope = np.empty_like(phasor), np.zeros_like(slope)  # of the landmark alone
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
         smooth = [name for name in free if name != "height_m" or self._reported]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
-            image, slopes = (
-                self._render_with_slopes(c, view[of], of, smooth) if smooth else (self._render(c, view[of], of), None)
-            )
-            phasor[of] = image.phasor.reshape(len(of), -1)
+            image, slopes, alone, alone_slopes = self._rendered(c, view[of], of, smooth, split=splits)
+            phasor[of], own_phasor[of] = (one.phasor.reshape(len(of), -1) for one in (image, alone))
             intensity[of] = image.intensity.reshape(len(of), -1)
             # a chip need not see a surface that fills a zone at a slant, or far away
             faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0) if self._reported else 1.0
             coverage[of] = np.minimum(image.coverage, faint).reshape(len(of), -1)
             for k, name in enumerate(free):
-                if slopes is not None and name in smooth:
-                    slope[of, k] = slopes[:, smooth.index(name)].reshape(len(of), -1)
+                if name in smooth:
+                    for into, values in ((slope, slopes), (own_slope, alone_slopes)):
+                        into[of, k] = values[:, smooth.index(name)].reshape(len(of), -1)
                     continue
                 moved = view[of]
                 moved[:, VIEW.index(name)] += STEP
                 width = (moved - view[of])[:, VIEW.index(name)]
-                there = self._render(c, moved, of).phasor.reshape(len(of), -1)
-                slope[of, k] = (there - phasor[of]) / width[:, None]
+                there, _, own_there, _ = self._rendered(c, moved, of, (), split=splits)
+                for into, end, start in ((slope, there, phasor), (own_slope, own_there, own_phasor)):
+                    into[of, k] = (end.phasor.reshape(len(of), -1) - start[of]) / width[:, None]
         if self._factored and "delta_rad" in free:  # a body of revolution looks the same from every side
             level, first = ~view[:, 3:].any(axis=1), self.sensor.lower_rows[0] * self.sensor.cols
-            slope[level, list(free).index("delta_rad"), :first] = 0
-        alone = self.alone
-        if alone is None:
+            for values in (slope, own_slope):
+                values[level, list(free).index("delta_rad"), :first] = 0
+        if not splits:
             return ModelImages(phasor, slope, intensity, coverage)
-        landmark = alone.images(class_index, view, free)
-        return ModelImages(phasor, slope, intensity, coverage, phasor - landmark.phasor, slope - landmark.slope)
+        return ModelImages(phasor, slope, intensity, coverage, phasor - own_phasor, slope - own_slope)
 
     def first_images(
         self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]
@@ -255,11 +257,26 @@ class RenderedModel(ImageModel):
             return self.sensor.lower_rows, self.sensor.lower_rows[0] * self.sensor.cols
         return None, 0
 
-    def _render_with_slopes(
-        self, class_index: int, view: NDArray[np.float64], which: NDArray[np.integer], free: Sequence[str]
-    ) -> tuple[PhasorImages, NDArray[np.complex128]]:
+    def _rendered(
+        self,
+        class_index: int,
+        view: NDArray[np.float64],
+        which: NDArray[np.integer],
+        free: Sequence[str],
+        *,
+        split: bool,
+    ) -> SplitImages:
+        """Return images and their slopes, and the same of the landmark alone; twice the same unless light is split."""
         renderer, views = self._renderers[class_index], Views(*np.ascontiguousarray(view.T))
-        return renderer.render_with_slopes(views, free, background=self._given_way(class_index, views, which))
+        background = self._given_way(class_index, views, which)
+        if split:
+            return renderer.render_split(views, free, background=background)
+        if free:
+            image, slope = renderer.render_with_slopes(views, free, background=background)
+        else:
+            image = renderer.render_views(views, background=background)
+            slope = np.empty((len(view), 0, *image.phasor.shape[1:]), np.complex128)
+        return image, slope, image, slope
 
     def _render(
         self,

@@ -22,6 +22,7 @@ from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.templates import Observation, seen_by_images
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, FILLED_COVERAGE
 from phasemark.render import PhasorImages
+from phasemark.render.phasor_images import phasor_to_range_m, wrap_difference_m
 from phasemark.render.threads import mapped
 
 _FAR_M = 1e6
@@ -275,12 +276,19 @@ def _intervals(
         half[edge] = farther_in * bank.sensor.pixel_rad * np.abs(ranges[edge])
     if seen.open_edges:
         half[edge], may = _FAR_M, may | edge
-    found = [_Intervals(ranges, half, may, must)]
-    for ratio in seen.ratios:
-        other, *_ = seen_by_images(ratio * phasor, coverage, bank.sensor, seen.behind, seen.rows)
-        found.append(found[0]._replace(middle_m=other))
-    spanned = _span(found, bank.sensor.unambiguous_range_m) if seen.ratios else found[0]
-    return spanned.each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))
+    if seen.ratios and seen.behind is not None:
+        mixed = edge & may
+        share = 1 - coverage.reshape(ranges.shape)[mixed]
+        behind = share * np.broadcast_to(seen.behind.phasor[0, slice(*seen.rows)].ravel(), ranges.shape)[mixed]
+        own = phasor.reshape(ranges.shape)[mixed]
+        off = [
+            wrap_difference_m(phasor_to_range_m(ratio * own + behind, bank.sensor) - ranges[mixed], bank.sensor)
+            for ratio in seen.ratios
+        ]
+        low, high = np.minimum(0.0, np.min(off, axis=0)), np.maximum(0.0, np.max(off, axis=0))
+        ranges[mixed] += (low + high) / 2
+        half[mixed] += (high - low) / 2
+    return _Intervals(ranges, half, may, must).each(lambda values: values.reshape(n_d, -1, ranges.shape[1]))
 
 
 def _hull(

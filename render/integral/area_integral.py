@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -60,6 +60,26 @@ class Slopes:
     by_pixel: NDArray[np.complex128]
     motion: Callable[[slice, Poses, Camera], Motion]
     turns: NDArray[np.bool_]
+
+
+@dataclass
+class Alone:
+    """Light of the surface without what stands behind it, filled beside the sums.
+
+    Parameters
+    ----------
+    slope_by_pixel : complex128
+        As :class:`Slopes` has them.
+    sums : Sums, optional
+        Phasors; all else is that of the whole.
+    """
+
+    slope_by_pixel: NDArray[np.complex128]
+    sums: Sums | None = None
+
+
+_Layer = tuple[float, Sums, Slopes | None]
+"""Albedo of the surface, and what its light is added to."""
 
 
 class AreaIntegral:
@@ -116,6 +136,7 @@ class AreaIntegral:
         workers: int = 1,
         variant: Variant = "exact",
         slopes: Slopes | None = None,
+        alone: Alone | None = None,
     ) -> Sums:
         """Return the sums of all pixels.
 
@@ -132,6 +153,8 @@ class AreaIntegral:
         variant : {"exact", "hard"}
         slopes : Slopes, optional
             Filled too.
+        alone : Alone, optional
+            Filled too, with slopes if these are asked for; of the exact variant.
 
         Returns
         -------
@@ -141,6 +164,11 @@ class AreaIntegral:
         rows = (0, self.sensor.rows) if rows is None else rows
         n, columns_hz = len(poses.lens), self.columns_hz
         sums = no_light((n, rows[1] - rows[0], self.sensor.cols), len(columns_hz), n_parts)
+        layers = [(self.albedo, sums, slopes)]
+        if alone is not None:  # a surface that returns nothing leaves what stands behind it
+            dark = no_light((n, rows[1] - rows[0], self.sensor.cols), len(columns_hz), n_parts)
+            of_dark = None if slopes is None else replace(slopes, by_pixel=alone.slope_by_pixel)
+            layers.append((0.0, dark._replace(state=sums.state), of_dark))
         camera = camera_of(self.sensor, rows, points_a_side(poses.background))
         light = Light(
             self.albedo,
@@ -156,35 +184,43 @@ class AreaIntegral:
 
         def run(lane: Iterable[slice]) -> None:
             if variant == "exact" and not self.rays:
-                self._integrate(lane, poses, camera, light, sums, slopes)
+                self._integrate(lane, poses, camera, light, layers)
             else:
                 self._cast(lane, poses, camera, light, sums)
 
         mapped(run, lanes, workers)
+        if alone is not None:
+            alone.sums = sums._replace(phasor=sums.phasor - dark.phasor)
+            if slopes is not None:
+                alone.slope_by_pixel[:] = slopes.by_pixel - alone.slope_by_pixel
         return sums
 
     def _integrate(
-        self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums, slopes: Slopes | None
+        self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, layers: Sequence[_Layer]
     ) -> None:
-        """Integrate slices of the poses into `sums`, and `slopes` if they are asked for, in one thread."""
+        """Integrate slices of the poses into sums, and slopes if they are asked for, in one thread."""
+        slopes = layers[0][2]
         layout = Layout((camera.rows, camera.cols), n_parameters=0 if slopes is None else len(slopes.turns))
         with lend_buffers(self.topology, layout) as buffers:
-            self._integrate_with(buffers, tasks, every, camera, light, sums, slopes)
+            self._integrate_with(buffers, tasks, every, camera, light, layers)
 
     def _integrate_with(
-        self, buffers: Buffers, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums,
-        slopes: Slopes | None,
+        self, buffers: Buffers, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light,
+        layers: Sequence[_Layer],
     ) -> None:  # fmt: skip
-        mesh = self.topology
+        mesh, columns_hz = self.topology, self.columns_hz
+        columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
         for task in tasks:
-            poses, own = of_poses(every, task), _of_views(sums, task)
+            poses = of_poses(every, task)
             behind = poses.background[:, :2].any()
-            slope_sums = None
-            if slopes is not None:
-                columns_hz = self.columns_hz
-                columns = np.array([columns_hz.index(hz) for hz in self.sensor.frequencies_hz])
-                by_pixel = slopes.by_pixel[:, _pixels_of(task, sums)]
-                slope_sums = SlopeSums(by_pixel, columns, slopes.motion(task, poses, camera), own, slopes.turns)
+            parts = []
+            for albedo, sums, slopes in layers:
+                own, slope_sums = _of_views(sums, task), None
+                if slopes is not None:
+                    by_pixel = slopes.by_pixel[:, _pixels_of(task, sums)]
+                    slope_sums = SlopeSums(by_pixel, columns, slopes.motion(task, poses, camera), own, slopes.turns)
+                parts.append((light._replace(albedo=albedo), own, slope_sums))
+            own = parts[0][1]
             view, least = 0, NO_LEAST
             while view < len(poses.lens):
                 reached, n = plan_rays(
@@ -200,14 +236,16 @@ class AreaIntegral:
                     count_highlight_boxes(n, buffers.samples, mesh, poses, camera, least)
                     if (least > 1).any():
                         continue
-                sum_samples(n, buffers.samples, mesh, poses, camera, light, own)
-                if behind:
-                    add_background(view, reached, poses, camera, light, own)
-                if slope_sums is not None:
-                    slope_sums.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, light)
+                for lit, part, slope_sums in parts:
+                    sum_samples(n, buffers.samples, mesh, poses, camera, lit, part)
+                    if behind:
+                        add_background(view, reached, poses, camera, lit, part)
+                    if slope_sums is not None:
+                        slope_sums.add((view, reached), n, buffers.samples, buffers.borders, mesh, poses, camera, lit)
                 view = reached
-            if slope_sums is not None:
-                slope_sums.conclude()
+            for _, _, slope_sums in parts:
+                if slope_sums is not None:
+                    slope_sums.conclude()
 
     def _cast(self, tasks: Iterable[slice], every: Poses, camera: Camera, light: Light, sums: Sums) -> None:
         """Sum slices of the poses with evenly spread rays into `sums`, in one thread."""
