@@ -133,6 +133,14 @@ def test_a_run_of_another_plan_is_not_continued_and_the_difference_named(unfinis
     check_toy_file(unfinished)
 
 
+def test_an_unfinished_run_that_replaces_a_file_goes_on_by_both_options(unfinished):
+    unfinished.write_text("what was there before")
+    with pytest.raises(OutputExistsError, match="stands beside the unfinished run that replaces it: give force=True"):
+        build(ToyJob(), unfinished, resume=True)
+    build(ToyJob(), unfinished, resume=True, force=True)
+    check_toy_file(unfinished)
+
+
 def test_an_unfinished_run_is_not_thrown_away_unasked(unfinished):
     with pytest.raises(OutputExistsError, match="resume=True continues it, force=True starts over"):
         build(ToyJob(), unfinished)

@@ -188,6 +188,8 @@ def build(
     path = followed(given)
     if resume and _publish_again(job, path):
         return given
+    if resume and not force and path.exists() and partial_path(path).exists():
+        raise OutputExistsError(f"{path}: stands beside the unfinished run that replaces it: give force=True, too")
     for target in (given, checksum_path(path)):
         refuse_unwritable(target, force=force)
     with storage_errors(path), _Run.locked(path, force=force) as run:
