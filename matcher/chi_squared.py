@@ -13,12 +13,21 @@ def noise_tails(frames: FilteredFrames) -> NDArray[np.float64]:
     """Return what widens the law of χ² of each frame, (n, 2).
 
     The first is ν where the variances were estimated from the scatter of ν + 1 exposures, infinite elsewhere; the
-    second the `overdispersion` of the sensor where they are those of its noise law.
+    second the `overdispersion` of the sensor where they are those of its noise law, and where the scatter of all pixels
+    scaled that law, what the median of their χ² over ν leaves unknown of it: 1 / (8 m² f²) with the median m of χ² at ν
+    and its density f there, however many pixels there are.
     """
-    if not frames.std_from_scatter:
-        return np.tile([np.inf, frames.sensor.overdispersion], (len(frames), 1))
     n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
     nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n]) - 1
+    if not frames.std_from_scatter:
+        tails = np.tile([np.inf, frames.sensor.overdispersion], (len(frames), 1))
+        if frames.std_is_pooled:
+            scattered = nu > 0.5
+            half = nu[scattered] / 2
+            median = special.chdtri(2 * half, 0.5)
+            density = np.exp((half - 1) * np.log(median / 2) - median / 2 - special.gammaln(half)) / 2
+            tails[scattered, 1] += 1 / (8 * (median * density) ** 2)
+        return tails
     # the variance of F(1, ν) exists above 4
     return np.column_stack([np.maximum(nu, 5.0), np.zeros(len(nu))])
 

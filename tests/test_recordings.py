@@ -14,9 +14,10 @@ from phasemark.cli import main
 from phasemark.data import open_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
+from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.commands.match_table import bank_ends, summary
 from phasemark.matcher.recordings.estimates_table import match_in_batches
-from phasemark.render import Background, Renderer, capture, preset
+from phasemark.render import Background, Frames, Renderer, capture, preset
 from phasemark.render.direct import HistogramRenderer
 from phasemark.render.sensor.sensor_file import sensor_toml
 
@@ -154,6 +155,18 @@ def test_answers_do_not_depend_on_the_size_of_a_batch_and_single_frames_have_the
     pooled = filtered.with_pooled_noise()
     assert (pooled.std_m[returned] == ZONES.range_std_m).all()
     assert not pooled.std_from_scatter
+
+
+@pytest.mark.parametrize(("n_frames", "alone"), [(2, 0.13), (3, 0.065)])
+def test_few_frames_are_refused_hardly_more_often_than_stated_though_their_scatter_tells_the_noise(n_frames, alone):
+    """χ² over a variance that the median of 64 zones tells: as if it were known, 13 and 6.5 % of all are below 1 %."""
+    rng, n = np.random.default_rng(3), 2000
+    ranges = 0.8 + 3 * ZONES.range_std_m * rng.standard_normal((n, n_frames, 8, 8))  # three times as noisy as stated
+    pooled = kalman_filter(Frames(ranges, sensor=ZONES)).with_pooled_noise()
+    cost = (((pooled.range_m - 0.8) / pooled.std_m) ** 2).reshape(n, -1).sum(axis=1)
+    tails, dof = noise_tails(pooled), np.full(n, 64)
+    assert np.mean(p_values_of(cost, dof, tails) < 0.01) < 0.045
+    assert np.mean(p_values_of(cost, dof, np.tile([np.inf, 0.0], (n, 1))) < 0.01) == pytest.approx(alone, abs=0.025)
 
 
 @pytest.mark.soak

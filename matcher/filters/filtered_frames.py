@@ -64,6 +64,9 @@ class FilteredFrames:
     std_from_scatter : bool
         True if `std_m` was estimated from the scatter of the frames themselves, with n − 1 degrees of freedom, rather
         than predicted from amplitude and intensity: tests then need F, not χ².
+    std_is_pooled : bool
+        True if the scatter of all pixels of a position together told the size of its noise,
+        :meth:`with_pooled_noise`: tests then have to allow for how well it did.
     time_s : (n,) float64, optional
         Mean time stamp of the frames at each position, seconds.
     tilt_rad : (n, 2) float64, optional
@@ -87,6 +90,7 @@ class FilteredFrames:
     n_effective: NDArray[np.float64]
     sensor: Sensor
     std_from_scatter: bool = False
+    std_is_pooled: bool = False
     time_s: NDArray[np.float64] | None = None
     tilt_rad: NDArray[np.float64] | None = None
     by_frequency: tuple[FilteredFrames, ...] = ()
@@ -138,8 +142,9 @@ class FilteredFrames:
         for name in (*_ARRAYS, "time_s", "tilt_rad"):
             arrays = [getattr(part, name) for part in parts]
             joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
-        scattered = any(part.std_from_scatter for part in parts)
-        return replace(parts[0], std_from_scatter=scattered, by_frequency=(), **joined)
+        for name in ("std_from_scatter", "std_is_pooled"):
+            joined[name] = any(getattr(part, name) for part in parts)
+        return replace(parts[0], by_frequency=(), **joined)
 
     def with_pixels(self, move: Callable[[NDArray[Any]], NDArray[Any]]) -> FilteredFrames:
         """Return the frames with their pixels elsewhere: mirrored or turned images of the same camera."""
@@ -201,7 +206,7 @@ class FilteredFrames:
         # least variance over that of the law; frames without any scatter are simulated, or frozen
         least_pooled = 1e-4
         std = np.sqrt(np.maximum(scale, least_pooled)) * law / np.sqrt(np.maximum(n, 1.0))
-        return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False)
+        return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False, std_is_pooled=True)
 
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
