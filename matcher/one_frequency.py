@@ -268,9 +268,12 @@ class OneFrequencyRenderer(Renderer):
         seen, slope = self._renderer.render_with_slopes(views, *parameters, **options)
         return self._one.images(seen), self._one.slopes(seen, slope)
 
-    def render_split(self, views: Views, *parameters: Any, **options: Any) -> SplitImages:
-        """Render views and their slopes, and those of the landmark alone."""
-        seen, slope, alone, own = self._renderer.render_split(views, *parameters, **options)
+    def render_split(
+        self, views: Views, *parameters: Any, rows: tuple[int, int] | None = None, **options: Any
+    ) -> SplitImages:
+        """Render views and their slopes, and those of the landmark alone; `rows` are all, or a half of the image."""
+        lit = self._one.rows(rows)
+        seen, slope, alone, own = self._renderer.render_split(views, *parameters, rows=lit, **options)
         one = self._one
         return one.images(seen), one.slopes(seen, slope), one.images(alone), one.slopes(alone, own)
 

@@ -385,10 +385,17 @@ class Renderer:
         images = self._render(seen, behind, (0, self.sensor.rows), workers, slope=by_pixel, parameters=parameters)
         return replace(images, views=views), self._slopes(by_pixel, seen, behind, parameters, workers)
 
-    def render_split(self, views: Views, parameters: Sequence[str], *, background: Backgrounds) -> SplitImages:
+    def render_split(
+        self,
+        views: Views,
+        parameters: Sequence[str],
+        *,
+        background: Backgrounds,
+        rows: tuple[int, int] | None = None,
+    ) -> SplitImages:
         """Render views with their slopes, and what the landmark alone returns in them, from the same samples.
 
-        Parameters are those of :meth:`render_with_slopes`; none may be named.
+        Parameters are those of :meth:`render_with_slopes`; with none, `rows` may be some.
 
         Returns
         -------
@@ -402,8 +409,8 @@ class Renderer:
         seen = views.in_camera(self.sensor)
         behind = self._checked(seen, background, 1)
         by_pixel, alone = self._no_slopes(len(views), parameters), Alone(self._no_slopes(len(views), parameters))
-        whole = (0, self.sensor.rows)
-        images = self._render(seen, behind, whole, 1, slope=by_pixel, parameters=parameters, alone=alone)
+        lit = (0, self.sensor.rows) if rows is None else rows
+        images = self._render(seen, behind, lit, 1, slope=by_pixel, parameters=parameters, alone=alone)
         assert alone.sums is not None
         return (
             replace(images, views=views),

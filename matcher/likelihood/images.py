@@ -78,6 +78,10 @@ class ImageModel(ABC):
         """
         return None
 
+    def lit(self, factor: NDArray[np.float64]) -> ImageModel:
+        """Return the model whose landmarks are brighter by factors (m,), one for each view, where `alone` is one."""
+        raise NotImplementedError
+
     def of_frames(self, frame: NDArray[np.int64]) -> ImageModel:
         """Return the model whose views are those of some frames (m,), each before what stands behind it there.
 

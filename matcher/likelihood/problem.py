@@ -288,11 +288,12 @@ class Problem:
             Returns the change of a model's images, whose landmarks are as bright as the bank has them; None of a model
             that is smooth, which is then returned.
         """
+        if not self.with_albedo:
+            return change(self.model)
+        if self.model.alone is not None:
+            return change(self.model.lit(factor))
         whole = change(self.model)
-        if whole is None or not self.with_albedo:
-            return whole
-        alone = None if self.model.alone is None else change(self.model.alone)
-        return whole * factor[:, None, None] if alone is None else whole + (factor[:, None, None] - 1) * alone
+        return None if whole is None else whole * factor[:, None, None]
 
     def _landmark_alone(self, images: ModelImages) -> NDArray[np.complex128]:
         if images.behind is not None:

@@ -76,6 +76,7 @@ class RenderedModel(ImageModel):
         """Take what stands behind all frames, or each of them."""
         self._backgrounds = tuple(backgrounds)
         self._frame: NDArray[np.int64] | None = None
+        self._factor: NDArray[np.float64] | None = None
         self._floors = any(background is not None and background.floor_m is not None for background in backgrounds)
         wall_m = [None if background is None else background.wall_m for background in backgrounds]
         self._wall_m = np.array([math.inf if wall is None else wall for wall in wall_m])
@@ -112,6 +113,12 @@ class RenderedModel(ImageModel):
             return None
         other = copy.copy(self)
         other._backgrounds, other._floors = (None,) * len(self._backgrounds), False
+        return other
+
+    def lit(self, factor: NDArray[np.float64]) -> RenderedModel:
+        """Return the model whose landmarks are brighter by some factors (m,), one for each view."""
+        other = copy.copy(self)
+        other._factor = factor
         return other
 
     def limits(
@@ -286,7 +293,12 @@ class RenderedModel(ImageModel):
         rows: tuple[int, int] | None = None,
     ) -> PhasorImages:
         renderer, views = self._renderers[class_index], Views(*np.ascontiguousarray(view.T))
-        return renderer.render_views(views, background=self._given_way(class_index, views, which), rows=rows)
+        background = self._given_way(class_index, views, which)
+        if self._factor is None:
+            return renderer.render_views(views, background=background, rows=rows)
+        image, _, alone, _ = renderer.render_split(views, (), background=background, rows=rows)
+        more = (self._factor[which] - 1).reshape(-1, *[1] * (image.phasor.ndim - 1))
+        return replace(image, phasor=image.phasor + more * alone.phasor)
 
     def _behind(self, which: NDArray[np.integer]) -> list[Background | None]:
         """Return the backgrounds of some of the views."""
