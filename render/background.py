@@ -14,8 +14,8 @@ from phasemark import UsageError
 from phasemark.render.kernel import inner
 from phasemark.render.view import FARTHEST_M, Footprint, Views
 
-UNSTATED_ALBEDO_STD = 0.5
-"""How well a landmark's albedo is known beside that of wall and floor, as a share of it, where nobody states either."""
+UNSTATED_ALBEDO_STD = 1.0
+"""How well the logarithm of a landmark's albedo is known beside that of wall and floor where nobody states either."""
 BOUNCES = 4
 """Column of the number of bounces among the parameters of a background."""
 Bounces = int | Literal["all"]
@@ -54,9 +54,10 @@ class Background:
         How well the floor's albedo is known: where light bounces, matching estimates it with this prior, and has what
         is left in the covariance. Of 0.05 to 0.6: 0.33 ± 0.16.
     albedo_ratio_std : float
-        How well the landmark's albedo is known beside that of wall and floor, as a share of it: a pixel that sees both
-        has the range of their mixture. Matching ranges estimates it with this prior, unless a sensor reports one
-        surface; on phasors it is free anyway. 0: as it is stated.
+        Standard deviation of the logarithm of the landmark's albedo over that of wall and floor: a pixel that sees both
+        has the range of their mixture. Matching ranges estimates the ratio with this prior, unless a sensor reports one
+        surface or the floor's albedo is estimated; on phasors the landmark's albedo is free, and wall and floor are as
+        bright as stated. 0: as it is stated.
 
     Raises
     ------

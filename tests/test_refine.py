@@ -182,6 +182,16 @@ def test_before_a_wall_of_unknown_albedo_the_error_is_the_bound_with_it(matcher_
         assert not run_trials(stated, dark, "cone", setup, 10, np.random.default_rng(2)).accepted.any()
 
 
+def test_a_wall_much_darker_than_supposed_leaves_the_covariance_right(matcher_of, renderers):
+    # N = 24, a ratio of albedos of three times that which is supposed
+    supposed = Background(wall_m=2.5, albedo_ratio_std=1.0)
+    setup = TrialSetup(background=Background(wall_m=2.5, wall_albedo=0.17), n_frames=5)
+    matcher = matcher_of(free=VIEW[:2], background=supposed)
+    trials = run_trials(matcher.match, renderers["cone"], "cone", setup, 24, np.random.default_rng(4))
+    assert trials.accepted.mean() > 0.8
+    assert trials.summary().nees.value < 1 + 3.3 / math.sqrt(24)
+
+
 def test_on_phasors_the_albedo_does_not_matter(bank, matcher_of):
     # 30 % darker than the bank has it; N = 30
     dark = Renderer(build_mesh(catalog()["cylinder"]), SENSOR, albedo=0.56)

@@ -66,7 +66,7 @@ _FEWEST_PER_PARAMETER, _FURTHER_ZONES = 6, 3
 surface each, that an answer explains beyond its number of free parameters."""
 _WALL_MOVES_M = 0.1
 """By how much a wall may be elsewhere than is expected of a frame that is tracked."""
-_ALBEDO_RATIOS = 0.5, 2.0
+_ALBEDO_RATIOS = 1 / 8, 8.0
 """Factors on a landmark's brightness beside the background's between which it is looked for where it is free."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
 _PIXELS_AT_ONCE = 1 << 22
@@ -207,10 +207,12 @@ class LikelihoodMatcher:
         return [by_frame[k] for k in range(len(frames))]
 
     def _albedo_std(self) -> float:
-        """Return how well the landmark's albedo is known beside that of wall and floor."""
+        """Return how well the logarithm of the landmark's albedo is known beside that of wall and floor."""
         if self._auto:
             return UNSTATED_ALBEDO_STD
-        return 0.0 if self._stated is None else self._stated.albedo_ratio_std
+        if self._stated is None or self._stated.estimates_floor_albedo:  # which is estimated for a landmark as stated
+            return 0.0
+        return self._stated.albedo_ratio_std
 
     @property
     def rules(self) -> Rules:
@@ -330,9 +332,8 @@ class LikelihoodMatcher:
     @cached_property
     def _rendered(self) -> RenderedModel:
         """What renders the landmarks of the bank, made when it is first needed."""
-        moves = set(self._setup.free) & {"bearing_rad", "pitch_rad", "roll_rad"}
         fits_albedo = self._setup.on == "phasors" or self._setup.albedo_std > 0
-        splits = fits_albedo and (self._auto or self._stated is not None) and bool(moves)
+        splits = fits_albedo and (self._auto or self._stated is not None)
         return RenderedModel(
             self._bank,
             self._stated,

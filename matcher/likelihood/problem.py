@@ -31,6 +31,8 @@ SCALE = {**NATURAL_UNITS, ALBEDO: 0.1}
 
 _Scalar = TypeVar("_Scalar", bound=np.generic)
 
+_DIMMEST = 0.01
+"""Least factor on a landmark's brightness whose logarithm counts."""
 _STEEPEST_RAD = 1.2
 """Largest pitch and roll that a descent tries: at ± 90° of pitch, roll and bearing are one."""
 
@@ -65,8 +67,8 @@ class DescentSettings:
     around : ImageModel, optional
         What shows the views around a solution, where the images of the model itself are slow.
     albedo_std : float
-        Standard deviation of the factor on the landmark's brightness, about 1, before the frame was seen; 0: it is 1.
-        On phasors nothing is known of it.
+        Standard deviation of the logarithm of the factor on the landmark's brightness before the frame was seen; 0: the
+        factor is 1. On phasors nothing is known of it.
     policy : SearchPolicy
     """
 
@@ -218,31 +220,37 @@ class Problem:
         return np.asarray((self.prior_weight * self._from_prior(theta) ** 2).sum(axis=1))
 
     def _from_prior(self, theta: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far the free parameters are from what was expected of them, (m, p)."""
-        expected = np.zeros((len(theta), ALBEDO_COLUMN + 1))
-        expected[:, TILT] = self.evidence.tilt_rad[self.frame]
-        expected[:, ALBEDO_COLUMN] = 1.0
-        return np.asarray((theta - expected)[:, self.columns])
+        """Return how far free parameters are from what was expected, (m, p); of the albedo, its logarithm."""
+        off = theta.copy()
+        off[:, TILT] -= self.evidence.tilt_rad[self.frame]
+        off[:, ALBEDO_COLUMN] = np.log(np.maximum(theta[:, ALBEDO_COLUMN], _DIMMEST))
+        return np.asarray(off[:, self.columns])
 
     def with_prior(self, sums: Sums, theta: NDArray[np.float64]) -> Sums:
         """Add what was known of the parameters before the frame was seen."""
         if not self.prior_weight.any():
             return sums
-        cost, square = self.prior_cost(theta), np.diag(self.prior_weight)
+        cost, p = self.prior_cost(theta), len(self.columns)
         sums = replace(sums, cost=sums.cost + cost, capped=sums.capped + cost)
-        if sums.gradient.shape[1] < len(square):  # images without slopes
+        if sums.gradient.shape[1] < p:  # images without slopes
             return sums
-        gradient = sums.gradient - self.prior_weight * self._from_prior(theta)
+        rate = np.ones((len(theta), p))  # of what is known, by the parameters
+        if self.with_albedo:
+            rate[:, -1] /= np.maximum(theta[:, ALBEDO_COLUMN], _DIMMEST)
+        gradient = sums.gradient - self.prior_weight * self._from_prior(theta) * rate
+        square = (self.prior_weight * rate**2)[:, :, None] * np.eye(p)
         return replace(sums, gradient=gradient, information=sums.information + square)
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
         trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
-        phasor = images.phasor
+        phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides
             phasor = phasor - (theta[:, ALBEDO_COLUMN:] - 1) * images.slope[:, -1]
-        return counts(phasor, images.intensity, self.evidence.sensor) & trusted
+            if self.evidence.on == "ranges":  # its light and the background's may cancel: that has no range
+                trusted = trusted & counts(images.phasor, images.intensity, sensor)
+        return counts(phasor, images.intensity, sensor) & trusted
 
     def best_of_frames(self, state: State) -> NDArray[np.intp]:
         """Return the best candidate of each frame, in the order of the candidates, if its cost is within its limit."""

@@ -39,8 +39,8 @@ class RenderedModel(ImageModel):
     cache_bytes : int
         Room for images that other frames may start from too.
     splits_light : bool
-        Whether images know what of their phasors comes from the background: it depends on the bearing and the tilt of
-        the view.
+        Whether images know what of their phasors comes from the background: it differs across a pixel, and from view to
+        view.
     reported : bool
         Whether ranges are those that the chip of a direct sensor reports.
     """

@@ -56,7 +56,8 @@ class Setup:
         Whether the bearing is estimated with what is known of it.
     on : {"ranges", "phasors"}
     albedo_std : float
-        How well the landmark's albedo is known beside that of what stands behind it, on ranges; 0: as it is stated.
+        How well the logarithm of the landmark's albedo is known beside that of what stands behind it, on ranges; 0: as
+        it is stated.
     unknown : bool
         Whether unknown things may stand in view.
     reports_one_surface : bool
