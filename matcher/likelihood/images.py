@@ -70,17 +70,12 @@ class ImageModel(ABC):
 
     slopes_are_cheap = True
 
-    @property
-    def alone(self) -> ImageModel | None:
-        """The same without a background, where what that returns depends on the view and the brightness is estimated.
+    def lit(self, factor: NDArray[np.float64]) -> ImageModel | None:
+        """Return the model whose landmarks are brighter by factors (m,), one for each view.
 
-        Images then have `behind`. None elsewhere.
+        None where what stands behind returns nothing, or is not told apart.
         """
         return None
-
-    def lit(self, factor: NDArray[np.float64]) -> ImageModel:
-        """Return the model whose landmarks are brighter by factors (m,), one for each view, where `alone` is one."""
-        raise NotImplementedError
 
     def of_frames(self, frame: NDArray[np.int64]) -> ImageModel:
         """Return the model whose views are those of some frames (m,), each before what stands behind it there.

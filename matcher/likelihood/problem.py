@@ -298,8 +298,8 @@ class Problem:
         """
         if not self.with_albedo:
             return change(self.model)
-        if self.model.alone is not None:
-            return change(self.model.lit(factor))
+        if (lit := self.model.lit(factor)) is not None:
+            return change(lit)
         whole = change(self.model)
         return None if whole is None else whole * factor[:, None, None]
 

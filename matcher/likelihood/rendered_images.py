@@ -115,8 +115,10 @@ class RenderedModel(ImageModel):
         other._backgrounds, other._floors = (None,) * len(self._backgrounds), False
         return other
 
-    def lit(self, factor: NDArray[np.float64]) -> RenderedModel:
-        """Return the model whose landmarks are brighter by some factors (m,), one for each view."""
+    def lit(self, factor: NDArray[np.float64]) -> RenderedModel | None:
+        """Return the model whose landmarks are brighter by some factors (m,), where light is split."""
+        if self.alone is None:
+            return None
         other = copy.copy(self)
         other._factor = factor
         return other
