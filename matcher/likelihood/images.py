@@ -73,7 +73,7 @@ class ImageModel(ABC):
     def lit(self, factor: NDArray[np.float64]) -> ImageModel | None:
         """Return the model whose landmarks are brighter by factors (m,), one for each view.
 
-        None where what stands behind returns nothing, or is not told apart.
+        None where what stands behind returns nothing, or where its light is not separate from theirs.
         """
         return None
 
