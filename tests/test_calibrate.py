@@ -36,7 +36,7 @@ from phasemark.render import Background, Frames, Renderer, Sensor, Views, captur
 from phasemark.render.direct import HistogramRenderer
 
 PMD = preset("pmd-16x16")
-MESH = build_mesh(catalog()["cylinder"])
+MESH, CONE = (build_mesh(catalog()[name]) for name in ("cylinder", "cone"))
 DEGREE = math.radians(1.0)
 ERRORS = PoseStd(2e-3, 0.2 * DEGREE, 0.3 * DEGREE)
 
@@ -58,13 +58,13 @@ def some_poses(rng, n):
     return KnownPoses.polar(rng.uniform(0.8, 1.8, n), rng.uniform(0, 2 * math.pi, n), rng.uniform(-4, 4, n) * DEGREE)
 
 
-def take(mounting, poses, rng, *, sensor=PMD, background=None, n_frames=50, light=True):
+def take(mounting, poses, rng, *, mesh=MESH, sensor=PMD, background=None, n_frames=50, light=True):
     """Frames of a camera mounted so, labelled with the sensor that the user assumes."""
     there = mounting.on(sensor).with_(bearing_offset_deg=0.0, height_offset_m=0.0)  # they are in the views
     views = Views(
         poses.distance_m, poses.delta_rad, poses.bearing_rad + mounting.bearing_rad, poses.height_m + mounting.height_m
     )
-    image = Renderer(MESH, there, albedo=mounting.albedo).render_views(views, background=background)
+    image = Renderer(mesh, there, albedo=mounting.albedo).render_views(views, background=background)
     frames = capture(image, there, rng=rng, n_frames=n_frames)
     return Frames(
         frames.range_m,
@@ -292,6 +292,29 @@ def test_exchanged_poses_are_named_and_a_fit_without_a_model_is_doubted(pair):
     assert f"two poses are likely exchanged: pose {pair[0]} and pose {pair[1]}" in said
     if pair == (2, 7):
         assert "times what noise leaves" in doubts
+
+
+@pytest.mark.parametrize(
+    ("seed", "upside_down", "delta", "right"),
+    [
+        # the fit is worse than noise, with exact poses
+        (9101, True, 1, "images are likely upside down: give flip_v=True"),
+        (9103, False, -1, "δ of the poses likely has the other sign"),
+        # errors of the poses that the fit itself estimates explain it
+        pytest.param(9102, True, 1, "images are likely upside down: give flip_v=True", marks=pytest.mark.soak),
+    ],
+)
+def test_frames_upside_down_and_other_signs_of_delta_are_doubted(seed, upside_down, delta, right):
+    """A cone's frames fit them, with pitches and poses that are a little wrong."""
+    rng = np.random.default_rng(seed)
+    truth, poses = some_mounting(rng, 0.8), some_poses(rng, 12)
+    frames = filtered(take(truth, poses, rng, mesh=CONE), "ranges")
+    if upside_down:
+        frames = frames.with_pixels(lambda values: values[..., ::-1, :])
+    wrong = KnownPoses.polar(poses.distance_m, delta * poses.delta_rad, poses.bearing_rad)
+    found = calibrate(CONE, frames, wrong, on="ranges")
+    assert found.doubts
+    assert found.cause == right
 
 
 def test_cartesian_poses_are_the_inverse_of_the_robot_equations():
@@ -590,7 +613,6 @@ def test_95_percent_ellipses_hold_the_truth_in_93_to_97_percent_of_500_runs(on):
 
 TOF = preset("vl53l5cx-8x8")
 BOARD = trimesh.creation.box((0.02, 2.0, 2.0))
-CONE = build_mesh(catalog()["cone"])
 FREE = ("pitch", "roll", "bearing", "half_angle_h", "range_offset", "delay")
 TURNING = Mounting(0.5 * DEGREE, -0.7 * DEGREE, 0.0, DEGREE, 22.8 * DEGREE, 22.5 * DEGREE, 0.01, 0.8, -0.075)
 TOF_NOISE = {"range_std_m": 2e-3, "range_ambient_std_m": 4e-3}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 _NAMED_ALIKE = (
-    "amplitude_unit", "board", "content", "flip_h", "force", "free", "generator", "moving", "quantity", "resume",
-    "scheduler", "to", "topic", "unit", "valid_status",
+    "amplitude_unit", "board", "content", "flip_h", "flip_v", "force", "free", "generator", "moving", "quantity",
+    "resume", "rotate", "scheduler", "to", "topic", "unit", "valid_status",
 )  # fmt: skip
 FLAGS = {
     **{name: f"--{name.replace('_', '-')}" for name in _NAMED_ALIKE},

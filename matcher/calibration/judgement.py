@@ -15,12 +15,14 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.matcher.calibration.mounting import ALL_NAMES, PARAMETERS, clipped, prior_std
 from phasemark.matcher.calibration.mounting_model import natural_units
+from phasemark.matcher.calibration.notes import pose_std_text
 from phasemark.matcher.calibration.problem import Problem, Solution
 from phasemark.matcher.calibration.recording_effects import TURN, own_text
 from phasemark.matcher.calibration.recording_fit import RecordingFit
 from phasemark.render.frames import MOST_TILT_DEG
 
 _Change = Callable[[Problem], Problem]
+_Changes = list[tuple[_Change, str]]
 TRUSTED = 3.0
 """Prior standard deviations beyond which a result is not trusted."""
 _MOST_FRAMES_OUT = 0.15
@@ -76,6 +78,16 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
         doubts.append(f"χ² is {solution.chi2 / solution.dof:.3g} times what noise leaves")
     if problem.track is not None:
         doubts += _doubts_of_recordings(solution)
+    astray_m, astray_rad, errors = 0.05, math.radians(5.0), solution.pose_std
+    if errors is not None and (errors.position_m > astray_m or max(errors.heading_rad, errors.delta_rad) > astray_rad):
+        doubts.append(f"the poses would have to be off by {pose_std_text(errors)}")
+    # χ² a degree of freedom, or share of pixels that disagree, which mirrored frames or poses leave at least
+    noisier, disagreeing = 1.5, 0.1
+    suspicious = errors is not None or solution.chi2 > noisier * solution.dof or solution.left_out > disagreeing
+    if suspicious and not doubts:
+        every = range(len(problem.recordings))
+        if _cause(_asked(problem), solution.edges, every, _mirrored):
+            doubts.append("frames or poses that are mirrored or turned over fit each other much better")
     return tuple(doubts)
 
 
@@ -143,7 +155,7 @@ def _doubt_of_quantity(solution: Solution) -> list[str]:
 def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
     """Return the likely cause of doubts: the change of a stated value that fits best, if it fits much better."""
     stated = _asked(solution.problem)
-    cause = _cause(stated, solution.edges, _suspects(solution))
+    cause = _cause(stated, solution.edges, _suspects(solution), _alternatives)
     if cause:
         return cause
     for doubt in doubts:
@@ -176,7 +188,7 @@ def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
 
 def cause_of_refusal(problem: Problem) -> str:
     """Return the likely cause of frames that do not fit at all, or nothing: as a part of a sentence."""
-    cause = _cause(_asked(problem), None, range(len(problem.recordings)))
+    cause = _cause(_asked(problem), None, range(len(problem.recordings)), _alternatives)
     return f"; likely cause: {cause}" if cause else ""
 
 
@@ -192,21 +204,21 @@ def _suspects(solution: Solution) -> Sequence[int]:
     return sorted(apart) or range(len(solution.problem.recordings))
 
 
-def _cause(stated: Problem, edges: bool | None, suspects: Sequence[int]) -> str:
+def _cause(stated: Problem, edges: bool | None, suspects: Sequence[int], changes: Callable[[Problem], _Changes]) -> str:
     """Return the change that fits best: of several recordings of one that is suspect, and otherwise of all."""
     recordings = stated.recordings
     if len(recordings) > 1:
-        each = {k: _better(recordings[k], edges) for k in suspects}
+        each = {k: _better(recordings[k], edges, changes) for k in suspects}
         alike = len(each) == len(recordings) and len(set(each.values())) == 1
         if any(each.values()) and not alike:
             return "; ".join(f"of recording {k + 1}, {cause}" for k, cause in each.items() if cause)
-    return _better(stated, edges)
+    return _better(stated, edges, changes)
 
 
-def _better(stated: Problem, edges: bool | None) -> str:
+def _better(stated: Problem, edges: bool | None, changes: Callable[[Problem], _Changes]) -> str:
     """Return the sentence of the change that fits best and much better than what was stated; nothing if none does."""
     own = _tried(stated, edges)
-    tried = [(_tried(changed, edges), sentence) for changed, sentence in _alternatives(stated)]
+    tried = [(_tried(stated.changed(change), edges), sentence) for change, sentence in changes(stated)]
     enough = 0.6 * max([own.pixels, *(found.pixels for found, _ in tried)])  # what few pixels fit is no better
     own_square = own.mean_square if own.pixels >= enough else math.inf
     good = [(found.mean_square, found, text) for found, text in tried if found.pixels >= enough]
@@ -251,20 +263,20 @@ def _other_quantity(problem: Problem, reports_z: bool) -> Problem:
     return replace(problem, frames=replace(frames, range_m=quantity), reports_z=reports_z)
 
 
-def _other_quantities(problem: Problem) -> list[tuple[_Change, str]]:
+def _other_quantities(problem: Problem) -> _Changes:
     """Return how the numbers may have been taken wrongly, each with what they are then.
 
     A camera that reports z may have them read as ranges, too.
     """
-    both: list[tuple[_Change, str]] = [
+    both: _Changes = [
         (partial(_other_quantity, reports_z=True), "z"),
         (partial(_other_quantity, reports_z=False), "range"),
     ]
     return both if problem.reports_z else both[:1]
 
 
-def _flipped(problem: Problem) -> Problem:
-    return replace(problem, frames=problem.frames.with_pixels(lambda values: values[..., ::-1]))
+def _flipped(problem: Problem, axes: tuple[int, ...]) -> Problem:
+    return replace(problem, frames=problem.frames.with_pixels(lambda values: np.flip(values, axes)))
 
 
 def _in_order(problem: Problem, order: NDArray[np.integer]) -> Problem:
@@ -280,6 +292,14 @@ def _posed(problem: Problem, x: float = 1.0, y: float = 1.0, heading: float = 1.
     return replace(problem, poses=replace(poses, delta_rad=azimuth, bearing_rad=bearing))
 
 
+def _polar(problem: Problem, delta: float = 1.0, bearing: float = 1.0) -> Problem:
+    """Return a problem with δ and bearings of its poses multiplied, each as the camera sees it."""
+    poses = problem.poses
+    return replace(
+        problem, poses=replace(poses, delta_rad=delta * poses.delta_rad, bearing_rad=bearing * poses.bearing_rad)
+    )
+
+
 def _tilted(problem: Problem, pitch: float = 1.0, roll: float = 1.0) -> Problem:
     """Return a problem with the tilts of its poses multiplied."""
     poses = problem.poses
@@ -288,17 +308,28 @@ def _tilted(problem: Problem, pitch: float = 1.0, roll: float = 1.0) -> Problem:
     return replace(problem, poses=replace(poses, **{name: np.clip(own, -most, most) for name, own in tilts.items()}))
 
 
-def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
-    """Return problems that differ from the stated one in one value, each with what would then be right."""
-    changes: list[tuple[_Change, str]] = [
-        *((change, _QUANTITY.format(right=right)) for change, right in _other_quantities(stated)),
+def _mirrored(stated: Problem) -> _Changes:
+    """Return how frames or poses may be mirrored or turned over, each with what would then be right."""
+    return [
         (partial(_posed, y=-1, heading=-1), "angles of the poses likely have the other sign: counter-clockwise"),
         (partial(_posed, heading=-1), "headings of the poses likely have the other sign: counter-clockwise"),
         (partial(_posed, y=-1), "y of the poses, or δ, likely has the other sign"),
         (partial(_posed, x=-1), "x of the poses likely has the other sign: x_m is that of the lens"),
         (partial(_posed, x=-1, y=-1), "x and y of the poses likely have the other sign: they are those of the lens"),
+        (partial(_polar, delta=-1), "δ of the poses likely has the other sign"),
+        (partial(_polar, bearing=-1), "bearings of the poses likely have the other sign"),
+        (partial(_flipped, axes=(-1,)), "images are likely mirrored: give flip_h=True"),
+        (partial(_flipped, axes=(-2,)), "images are likely upside down: give flip_v=True"),
+        (partial(_flipped, axes=(-2, -1)), "images are likely turned over: give rotate=180"),
+    ]
+
+
+def _alternatives(stated: Problem) -> _Changes:
+    """Return changes of one value that was stated, each with what would then be right."""
+    changes: _Changes = [
+        *((change, _QUANTITY.format(right=right)) for change, right in _other_quantities(stated)),
+        *_mirrored(stated),
         (partial(_posed, heading=math.degrees(1)), "headings of the poses are likely radians: heading_deg is degrees"),
-        (_flipped, "images are likely mirrored: give flip_h=True"),
     ]
     if any(one.poses.are_tilted for one in stated.recordings):
         sign = "of the poses likely has the other sign: a positive"
@@ -326,7 +357,7 @@ def _alternatives(stated: Problem) -> list[tuple[Problem, str]]:
             late = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: leave the delay free"
             changes.append((_with_delay, late))
         changes += [(partial(_late, delay_s=delay_s), _CLOCKS) for delay_s in (-0.75, -0.5, -0.25, 0.25, 0.5, 0.75)]
-    return [(stated.changed(change), sentence) for change, sentence in changes]
+    return changes
 
 
 def _exchanged(stated: Problem) -> list[tuple[NDArray[np.integer], str]]:

@@ -101,12 +101,17 @@ def observability_notes(free: Sequence[str], covariance: _Float, scale: _Float, 
     return notes
 
 
+def pose_std_text(errors: PoseStd) -> str:
+    """Return the errors of poses with their units."""
+    heading, delta = np.degrees([errors.heading_rad, errors.delta_rad])
+    return f"{1e3 * errors.position_m:.0f} mm in place, {heading:.2g}° in heading, {delta:.2g}° in δ"
+
+
 def pose_std_note(estimated: PoseStd) -> str:
     """Say which errors of the poses were found from the residuals."""
     return (
         "With exact poses the residuals are more than noise. The poses were taken to be uncertain, by what the"
-        f" residuals say: {1e3 * estimated.position_m:.2g} mm in place, {math.degrees(estimated.heading_rad):.2g}°"
-        f" in heading, {math.degrees(estimated.delta_rad):.2g}° in δ (state yours with pose_std=…)."
+        f" residuals say: {pose_std_text(estimated)} (state yours with pose_std=…)."
     )
 
 

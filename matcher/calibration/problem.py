@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.calibration.known_poses import KnownPoses
+from phasemark.matcher.calibration.known_poses import KnownPoses, PoseStd
 from phasemark.matcher.calibration.mounting import Mounting
 from phasemark.matcher.calibration.mounting_model import CalibrationModel
 from phasemark.matcher.calibration.pose_track import LONGEST_GAP_S, PoseTrack
@@ -218,6 +218,8 @@ class Solution(Fitted):
         Fields of the sensor that were estimated beside the mounting.
     tilt_std_rad : (2,) float64
         By how much the tilts stated are off, pitch and roll.
+    pose_std : PoseStd, optional
+        Errors of poses that were said to be exact, estimated from residuals that are more than noise.
     """
 
     problem: Problem
@@ -227,6 +229,7 @@ class Solution(Fitted):
     frames_left_out: tuple[float, ...] = ()
     sensor_fields: Mapping[str, object] = field(default_factory=dict)
     tilt_std_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
+    pose_std: PoseStd | None = None
 
 
 def in_image(values: NDArray[np.float64], use: NDArray[np.bool_], sensor: Sensor) -> NDArray[np.float64]:

@@ -180,6 +180,7 @@ def _solution(
         edges=fit.edges,
         notes=tuple(notes),
         sensor_fields=sensor_fields,
+        pose_std=estimated,
     )
 
 
