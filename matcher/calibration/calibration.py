@@ -166,7 +166,8 @@ def calibrate(
         cause = cause_of_refusal(problem) if recorded or isinstance(error, AstrayError) else ""
         raise UsageError(f"{error}{cause}") from None
     doubts = doubts_about(solution)
-    return concluded(solution, doubts, likely_cause(solution, doubts) if doubts else "")
+    cause = likely_cause(solution, doubts) if doubts else ""
+    return concluded(solution, tuple(doubt.clause for doubt in doubts), cause)
 
 
 def _recordings(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -33,7 +33,7 @@ _BETTER = 0.5
 """Mean square of the residuals of an alternative, over that of what was assumed, from which it is the likely cause."""
 _FITS_M = 0.02
 """Root mean square residual below which an alternative fits at all."""
-_AS, _QUANTITY = "taken as ", "the numbers are likely {right}: give quantity={right}"
+_QUANTITY = "the numbers are likely {right}: give quantity={right}"
 _CLOCKS = "frames likely show the pose {delay_ms:+.0f} ms from their stamp: are both in one clock? state the delay"
 _HALVES = "first", "second"
 _MOST_APART = {
@@ -42,12 +42,52 @@ _MOST_APART = {
 }  # fmt: skip
 """By how much one of several recordings may differ from what they share, metres, radians, seconds: six times the usual
 and more. A delay is found up to a second."""
-_EXPECTED = "is known of the camera and the poses"
+_HARDLY_MOVES = (
+    "the camera hardly moves: turn and approach faster, or state the delay with Mounting(delay_s=…) and give"
+    " fixed=delay"
+)
+_TURNED = (
+    "the landmark is turned against the axes of these poses, or their y has the other sign: state its heading by"
+    " landmark_yaw_rad=…"
+)
+_UNEXPLAINED = (
+    "no change of delay, quantity or order explains it: are the landmark and its size right, do the poses refer to the"
+    " lens and the landmark's axis, and are all of one recording?"
+)
 
 
-def doubts_about(solution: Solution) -> tuple[str, ...]:
-    """List the reasons why a calibration cannot be trusted, as clauses; none for one that can be."""
-    doubts = []
+class Doubt(NamedTuple):
+    """Reason why a calibration cannot be trusted.
+
+    Parameters
+    ----------
+    clause : str
+    cause : str
+        What is likely wrong where there is no other doubt; nothing where the doubt does not tell.
+    sure : bool
+        Whether that holds beside other doubts, too.
+    """
+
+    clause: str
+    cause: str = ""
+    sure: bool = False
+
+
+def doubts_about(solution: Solution) -> list[Doubt]:
+    """List the reasons why a calibration cannot be trusted; none for one that can be."""
+    doubts = [*_doubts_of_fit(solution), *_doubts_of_recordings(solution)]
+    # χ² a degree of freedom, or share of pixels that disagree, which mirrored frames or poses leave at least
+    noisier, disagreeing = 1.5, 0.1
+    suspicious = solution.chi2 > noisier * solution.dof or solution.left_out > disagreeing
+    if not doubts and (suspicious or solution.pose_std is not None):
+        stated = _asked(solution.problem)
+        if _cause(stated, solution.edges, range(len(stated.recordings)), _mirrored):
+            doubts.append(Doubt("frames or poses that are mirrored or turned over fit each other much better"))
+    return doubts
+
+
+def _doubts_of_fit(solution: Solution) -> Iterator[Doubt]:
+    """Doubt numbers far from what was assumed, and fits that leave too much."""
     theta, problem = solution.theta, solution.problem
     assumed, scale = problem.assumed.vector, natural_units(problem.sensor)
     for name in problem.common:
@@ -57,43 +97,36 @@ def doubts_about(solution: Solution) -> tuple[str, ...]:
         most = TRUSTED * prior_std(name, assumed, scale)
         beyond = theta + 1e-9 * np.sign(theta[k] - assumed[k])
         if abs(theta[k] - assumed[k]) > most or clipped(beyond)[k] != beyond[k]:
-            doubts.append(
+            clause = (
                 f"the {one.title} ran to {one.text(theta[k])}, more than {one.text(most)} from the assumed"
                 f" {one.text(assumed[k])}"
             )
+            yield Doubt(clause, _CLOCKS.format(delay_ms=1e3 * theta[k]) if name == "delay" else "")
     before, after = solution.held_out_m
     grew = 1.02  # factor by which held-out residuals may grow: what counting other pixels may do
     if after > grew * before:
-        doubts.append(f"the residuals of held-out frames grew from {1e3 * before:.3g} to {1e3 * after:.3g} mm (r.m.s.)")
+        yield Doubt(f"the residuals of held-out frames grew from {1e3 * before:.3g} to {1e3 * after:.3g} mm (r.m.s.)")
     most_left_out = 0.5  # share of the pixels on the landmark that may disagree with the model
     if solution.left_out > most_left_out:
-        doubts.append(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
+        yield Doubt(f"{100 * solution.left_out:.0f} % of the pixels that should see the landmark disagree with it")
     out = solution.frames_left_out
     for k, share in enumerate(out, 1):
         if share > _MOST_FRAMES_OUT:
             whose = f" of recording {k}" if len(out) > 1 else ""
-            doubts.append(f"most pixels of {100 * share:.0f} % of the frames{whose} disagree with their poses")
+            yield Doubt(f"most pixels of {100 * share:.0f} % of the frames{whose} disagree with their poses")
     no_model = 20.0  # χ² a degree of freedom beyond which a covariance that is scaled by it means nothing
     if solution.chi2 > no_model * solution.dof:
-        doubts.append(f"χ² is {solution.chi2 / solution.dof:.3g} times what noise leaves")
-    if problem.track is not None:
-        doubts += _doubts_of_recordings(solution)
+        yield Doubt(f"χ² is {solution.chi2 / solution.dof:.3g} times what noise leaves")
     astray_m, astray_rad, errors = 0.05, math.radians(5.0), solution.pose_std
     if errors is not None and (errors.position_m > astray_m or max(errors.heading_rad, errors.delta_rad) > astray_rad):
-        doubts.append(f"the poses would have to be off by {pose_std_text(errors)}")
-    # χ² a degree of freedom, or share of pixels that disagree, which mirrored frames or poses leave at least
-    noisier, disagreeing = 1.5, 0.1
-    suspicious = errors is not None or solution.chi2 > noisier * solution.dof or solution.left_out > disagreeing
-    if suspicious and not doubts:
-        every = range(len(problem.recordings))
-        if _cause(_asked(problem), solution.edges, every, _mirrored):
-            doubts.append("frames or poses that are mirrored or turned over fit each other much better")
-    return tuple(doubts)
+        yield Doubt(f"the poses would have to be off by {pose_std_text(errors)}")
 
 
-def _doubts_of_recordings(solution: Solution) -> list[str]:
-    """List doubts about the delays of recordings, about pose errors and about z and range."""
-    doubts, problem = [], solution.problem
+def _doubts_of_recordings(solution: Solution) -> Iterator[Doubt]:
+    """Doubt the delays of recordings, their poses, and whether their numbers are z or ranges."""
+    problem = solution.problem
+    if not problem.moving:
+        return
     delays = [own["delay"][1] for own in solution.own if "delay" in own]
     if "delay" in problem.common:
         k = problem.common.index("delay")
@@ -102,21 +135,21 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
     for k, std in enumerate(delays, 1):
         if std > unknown_s:
             which = f"recording {k}" if len(delays) > 1 else "this recording"
-            doubts.append(f"the delay cannot be determined from {which} (± {1e3 * std:.0f} ms)")
+            clause = f"the delay cannot be determined from {which} (± {1e3 * std:.0f} ms)"
+            yield Doubt(clause, _HARDLY_MOVES)
     for k, own in enumerate(solution.own, 1):
         if apart := [own_text(name, own[name][0]) for name in _apart(own)]:
             which = f"recording {k}" if problem.others else "this recording"
-            doubts.append(f"{which} differs from what {_EXPECTED} by {', '.join(apart)}")
+            clause = f"{which} differs from what is known of the camera and the poses by {', '.join(apart)}"
+            yield Doubt(clause, _cause_apart(own))
     wander_m, wander_rad = 0.02, math.radians(3.0)
     distance, delta = (math.sqrt(float((solution.pose_shift[:, k] ** 2).mean())) for k in (0, 1))
     if distance > wander_m or delta > wander_rad:
-        doubts.append(
-            f"frames and poses disagree by {1e3 * distance:.2g} mm in distance and {math.degrees(delta):.2g}° in δ"
-            " (r.m.s.)"
-        )
+        apart_by = f"{1e3 * distance:.2g} mm in distance and {math.degrees(delta):.2g}° in δ (r.m.s.)"
+        yield Doubt(f"frames and poses disagree by {apart_by}")
     if (solution.tilt_std_rad > wander_rad).any():
         pitch, roll = np.degrees(solution.tilt_std_rad)
-        doubts.append(f"frames and the tilts of their poses disagree by {pitch:.2g}° in pitch and {roll:.2g}° in roll")
+        yield Doubt(f"frames and the tilts of their poses disagree by {pitch:.2g}° in pitch and {roll:.2g}° in roll")
     if "delay" not in problem.names:
         fixed = RecordingFit(problem, edges=solution.edges)
         freed = RecordingFit(problem.changed(_with_delay), edges=solution.edges)
@@ -124,13 +157,20 @@ def _doubts_of_recordings(solution: Solution) -> list[str]:
         stated = problem.assumed.delay_s
         moved = freed.delay_s(with_it) - stated
         if abs(moved) >= _DELAY_NOTED_S and freed.misfit(with_it)[0] <= _DELAY_GAIN * fixed.misfit(without)[0]:
-            doubts.append(f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * stated:.0f} ms")
+            yield Doubt(f"frames fit much better {1e3 * moved:+.0f} ms from the delay stated, {1e3 * stated:.0f} ms")
     if problem.sensor.kind == "direct" and "range_offset" in problem.common:
-        doubts += _doubt_of_quantity(solution)
-    return doubts
+        yield from _doubt_of_quantity(solution)
 
 
-def _doubt_of_quantity(solution: Solution) -> list[str]:
+def _cause_apart(own: Mapping[str, tuple[float, float]]) -> str:
+    """Return the likely cause of what a recording differs by alone, or nothing."""
+    apart = _apart(own)
+    if apart == ["delay"]:
+        return _CLOCKS.format(delay_ms=1e3 * own["delay"][0])
+    return _TURNED if apart == [TURN] else ""
+
+
+def _doubt_of_quantity(solution: Solution) -> Iterator[Doubt]:
     """Doubt that the numbers are z, or ranges, where the other fits much better, or as well with a smaller offset."""
     stated = _asked(solution.problem)
     own = _tried(stated, solution.edges)
@@ -141,49 +181,20 @@ def _doubt_of_quantity(solution: Solution) -> list[str]:
         left = abs(other.range_offset_m)
         if other.mean_square < min(_BETTER * own.mean_square, _FITS_M**2):
             misfits = [1e3 * math.sqrt(one.mean_square) for one in (other, own)]
-            return [
-                f"{_AS}{right} the numbers fit better, with residuals of {misfits[0]:.2g} and not {misfits[1]:.2g} mm"
-            ]
-        if offset > large_m and other.mean_square < as_well * own.mean_square and left < offset / 2:
-            return [
-                f"{_AS}{right} the numbers fit as well, with a range offset of {1e3 * left:.0f} mm in place of"
-                f" {1e3 * offset:.0f} mm"
-            ]
-    return []
+            how = f"better, with residuals of {misfits[0]:.2g} and not {misfits[1]:.2g} mm"
+        elif offset > large_m and other.mean_square < as_well * own.mean_square and left < offset / 2:
+            how = f"as well, with a range offset of {1e3 * left:.0f} mm in place of {1e3 * offset:.0f} mm"
+        else:
+            continue
+        yield Doubt(f"taken as {right} the numbers fit {how}", _QUANTITY.format(right=right), sure=True)
+        return
 
 
-def likely_cause(solution: Solution, doubts: Sequence[str]) -> str:
+def likely_cause(solution: Solution, doubts: Sequence[Doubt]) -> str:
     """Return the likely cause of doubts: the change of a stated value that fits best, if it fits much better."""
-    stated = _asked(solution.problem)
-    cause = _cause(stated, solution.edges, _suspects(solution), _alternatives)
-    if cause:
-        return cause
-    for doubt in doubts:
-        if doubt.startswith(_AS):
-            right = doubt.removeprefix(_AS).split()[0]
-            return _QUANTITY.format(right=right)
-    if len(doubts) == 1 and doubts[0].startswith(f"the {PARAMETERS['delay'].title} ran to"):
-        delay_s = float(solution.theta[ALL_NAMES.index("delay")])
-        return _CLOCKS.format(delay_ms=1e3 * delay_s)
-    if len(doubts) == 1 and _EXPECTED in doubts[0]:
-        own = solution.own[_suspects(solution)[0]]
-        apart = _apart(own)
-        if apart == ["delay"]:
-            return _CLOCKS.format(delay_ms=1e3 * own["delay"][0])
-        if apart == [TURN]:
-            return (
-                "the landmark is turned against the axes of these poses, or their y has the other sign: state its"
-                " heading by landmark_yaw_rad=…"
-            )
-    if len(doubts) == 1 and "delay cannot be determined" in doubts[0]:
-        return (
-            "the camera hardly moves: turn and approach faster, or state the delay with Mounting(delay_s=…) and give"
-            " fixed=delay"
-        )
-    return (
-        "no change of delay, quantity or order explains it: are the landmark and its size right, do the poses refer to"
-        " the lens and the landmark's axis, and are all of one recording?"
-    )
+    cause = _cause(_asked(solution.problem), solution.edges, _suspects(solution), _alternatives)
+    told = [doubt.cause for doubt in doubts if doubt.cause and (doubt.sure or len(doubts) == 1)]
+    return cause or next(iter(told), _UNEXPLAINED)
 
 
 def cause_of_refusal(problem: Problem) -> str:
