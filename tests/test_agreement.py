@@ -174,6 +174,23 @@ def test_what_stands_around_is_left_out_with_an_unknown_background(panel):
     assert (match.distance_m, match.delta_rad) == pytest.approx((0.6, 0.1), abs=0.01)
 
 
+def test_a_square_post_is_no_bracket_whose_plate_is_as_wide(thin_bank):
+    """Of 40 posts eight were: some fill the image, others go on above and below the bracket's outline."""
+    bank = thin_bank("bracket", "pmd-16x16")
+    matcher = Matcher(bank, "refine", background="unknown", free=("distance_m", "delta_rad"))
+    rng, away = np.random.default_rng(4), 10.0  # the post's axis, far enough for the lens to stand outside
+    for width_m, at_m in ((0.26, 0.67), (0.28, 0.64), (0.2, 0.92), (0.21, 0.56)):
+        for turn_rad in (-0.2, 0.0, 0.1):
+            post = box((width_m, width_m, 2.0))
+            post.apply_transform(trimesh.transformations.rotation_matrix(turn_rad, (0, 0, 1)))
+            post.apply_translation((at_m + width_m / 2 - away, 0, 0))
+            image = Renderer(post, bank.sensor, albedo=0.8).render(away)
+            (match,) = matcher.match(kalman_filter(capture(image, bank.sensor, rng=rng, n_frames=20)))
+            assert not match.accepted
+    (match,) = matcher.match(frames_of(bank, 0.8, 0.9, seed=3, n_frames=20))
+    assert match.accepted
+
+
 def test_few_returns_among_unknown_things_determine_nothing(panel):
     ranges = np.full((1, 1, 8, 8), np.nan)
     ranges[..., 7, 1:7] = 1.0  # a row of something

@@ -270,6 +270,13 @@ def test_what_is_not_understood_of_several_frequencies_is_refused_in_one_line(ba
             call()
 
 
+def test_frames_before_another_wall_are_refused_where_none_is_accepted(bank):
+    """No answer is left that may be mirrored, with the bearing free."""
+    _, image = scene(bank, WALL)
+    frames = kalman_filter(take(image, TWO, 10))[:2]
+    assert not Matcher(bank, "refine", background=Background(wall_m=2.5)).match(frames).accepted.any()
+
+
 # Each frequency by itself
 
 

@@ -425,6 +425,38 @@ def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(ma
     assert summary.coverage.high >= 0.92
 
 
+def test_an_estimated_floor_leaves_height_and_pitch_less_certain(bank_of_two, renderers):
+    """Joint information of view, albedo, wall and floor, by differences of images."""
+    free, prior = ("distance_m", "delta_rad", "height_m", "pitch_rad"), (math.inf, math.inf, 0.02, 0.03)
+    truth, cone = Background(wall_m=2.6, floor_m=0.2), renderers["cone"]
+    image = cone.render(1.0, 0.5, 0.0, 0.01, pitch_rad=0.01, background=truth)
+    frames = kalman_filter(capture(image, SENSOR, rng=np.random.default_rng(3), n_frames=20))
+    matcher = Matcher(
+        bank_of_two, "refine", free=free, background="auto", height_std_m=prior[2], pitch_std_rad=prior[3]
+    )
+    (match,) = matcher.match(frames)
+    assert match.accepted
+    at = np.array([*(getattr(match, name) for name in free), match.background.wall_m, match.background.floor_m])
+
+    def ranges(at):
+        behind = replace(match.background, wall_m=at[4], floor_m=at[5])
+        image = cone.render(at[0], at[1], 0.0, at[2], pitch_rad=at[3], background=behind)
+        return SENSOR.metres_per_radian * np.angle(image.phasor[0]).ravel()
+
+    step = 3e-4
+    rows = np.array([(ranges(at + own) - ranges(at - own)) / (2 * step) for own in step * np.eye(6)])
+    weight = np.where(frames.state[0] == PixelState.RETURN, frames.std_m[0] ** -2.0, 0.0).ravel()
+    information = (rows * weight) @ rows.T
+    information[range(4), range(4)] += np.array(prior) ** -2.0
+    joint, alone = (
+        np.sqrt(np.diag(np.linalg.inv(information)))[:4],
+        np.sqrt(np.diag(np.linalg.inv(information[:4, :4]))),
+    )
+    assert joint[2] > 1.5 * alone[2]
+    std = np.sqrt(np.diag(match.covariance))
+    np.testing.assert_allclose(std[2:], joint[2:], rtol=0.25)
+
+
 @pytest.mark.parametrize(
     ("name", "free", "n"),
     [

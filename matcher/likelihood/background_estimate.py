@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
-from phasemark.matcher.information import NATURAL_UNITS
+from phasemark.matcher.information import NATURAL_UNITS, covariance_of
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
@@ -36,8 +36,6 @@ _HEIGHTS = 256
 _BACKGROUND_STEP_M = 1e-3
 """Width of a difference between two places of a wall or floor."""
 _LONGEST_STEP = 3.0
-_VIEW_SCALE = tuple(NATURAL_UNITS[name] for name in VIEW)
-"""Natural units of the view."""
 _FIRST_DAMPING, _LEAST_DAMPING, _HOPELESS_DAMPING = 1e-3, 1e-9, 1e5
 _USUAL_ALBEDO = 0.5
 
@@ -212,19 +210,13 @@ def fit_background(
     background : Background
     view : (6,) float64
     """
-    names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
     columns = [VIEW.index(name) for name in free]
-    place_scale_m = 0.1  # natural unit of the places of wall and floor
-    scale = np.array([*(_VIEW_SCALE[k] for k in columns), *([place_scale_m] * len(names))])
-
-    def moved(place: NDArray[np.float64]) -> Background:
-        return replace(background, **dict(zip(names, place.tolist(), strict=True)))
+    place, scale = _places(background), _scales(free, background)
 
     def sums_at(at: NDArray[np.float64], place: NDArray[np.float64]) -> Sums | None:
-        beside = [moved(place + step) for step in np.eye(len(place)) * _BACKGROUND_STEP_M]
-        return _sums_before(model, evidence, class_index, at, free, moved(place), beside)
+        return _sums_before(model, evidence, class_index, at, free, _placed(background, place))
 
-    at, place = view.copy(), np.array([getattr(background, name) for name in names], np.float64)
+    at = view.copy()
     sums, damping = sums_at(at, place), _FIRST_DAMPING
     background_steps = 30
     # A step that promises to lower the whitened squared residual by less than this is not taken.
@@ -242,15 +234,61 @@ def fit_background(
         there = at.copy()
         there[columns] += (step * scale)[: len(columns)]
         there[0] = np.clip(there[:1], *model.limits(there[1:2]))[0]
-        placed = place + (step * scale)[len(columns) :]
-        tried = sums_at(there, placed) if (placed > 0).all() else None
+        there_place = place + (step * scale)[len(columns) :]
+        tried = sums_at(there, there_place) if (there_place > 0).all() else None
         if tried is not None and tried.cost[0] < sums.cost[0]:
-            at, place, sums, damping = there, placed, tried, max(damping * 0.1, _LEAST_DAMPING)
+            at, place, sums, damping = there, there_place, tried, max(damping * 0.1, _LEAST_DAMPING)
         else:
             damping *= 8
             if damping > _HOPELESS_DAMPING:
                 break
-    return moved(place), at
+    return _placed(background, place), at
+
+
+def part_of_background(
+    model: RenderedModel,
+    evidence: Evidence,
+    class_index: int,
+    view: NDArray[np.float64],
+    free: Sequence[str],
+    background: Background,
+    prior_std: Sequence[float],
+) -> NDArray[np.float64]:
+    """Return what the uncertainty of an estimated wall and floor adds to the covariance of a view, (p, p).
+
+    Parameters
+    ----------
+    model, evidence, class_index, view, free, background
+        As of :func:`fit_background`, at the solution.
+    prior_std : sequence of float
+        Of the free parameters before the frame was seen; empty where nothing is known.
+    """
+    p = len(free)
+    sums = _sums_before(model, evidence, class_index, view, free, background)
+    if sums is None:
+        return np.zeros((p, p))
+    information, scale = sums.information[0], _scales(free, background)
+    if prior_std:
+        information[range(p), range(p)] += np.array(prior_std) ** -2.0
+    joint = covariance_of(information, scale, weak="none")
+    return np.asarray(joint[:p, :p] - covariance_of(information[:p, :p], scale[:p], weak="none"))
+
+
+def _scales(free: Sequence[str], background: Background) -> NDArray[np.float64]:
+    """Return the natural units of free parameters, and of the places of wall and floor."""
+    place_m = 0.1
+    return np.array([*(NATURAL_UNITS[name] for name in free), *np.full(len(_places(background)), place_m)])
+
+
+def _places(background: Background) -> NDArray[np.float64]:
+    """Return how far the wall and the floor are, those that there are."""
+    return np.array([own for own in (background.wall_m, background.floor_m) if own is not None], np.float64)
+
+
+def _placed(background: Background, place: NDArray[np.float64]) -> Background:
+    """Return a background with the wall and the floor elsewhere."""
+    names = [name for name in ("wall_m", "floor_m") if getattr(background, name) is not None]
+    return replace(background, **dict(zip(names, place.tolist(), strict=True)))
 
 
 def _sums_before(
@@ -260,16 +298,17 @@ def _sums_before(
     view: NDArray[np.float64],
     free: Sequence[str],
     background: Background,
-    beside: Sequence[Background],
 ) -> Sums | None:
     """Return the sums of one frame with the slopes by the view and by wall and floor; None where a view is impossible.
 
-    Each background in `beside` has one of these moved by a small step.
+    The slopes by wall and floor are those over a small step of each.
     """
     before, which = model.with_background(background), np.array([class_index])
     nearest, farthest = before.limits(view[1:2])
     if not nearest[0] <= view[0] <= farthest[0]:
         return None
+    place = _places(background)
+    beside = [_placed(background, place + step) for step in np.eye(len(place)) * _BACKGROUND_STEP_M]
     try:
         image = before.images(which, view[None], free)
         moved = [model.with_background(own).images(which, view[None], ()).phasor for own in beside]

@@ -114,7 +114,9 @@ def whole_cost(problem: Problem, state: State) -> tuple[NDArray[np.float64], NDA
 def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return whether solutions among unknown things show a landmark that stands where the model has it, (m,).
 
-    Things before a landmark hide it, but none is seen through it, and what continues beyond its outline is none.
+    Things before a landmark hide it, but none is seen through it, and what continues beyond its outline is none: on
+    each of its four sides it must end as often as it continues. A plane face may be that of any board, wall or post,
+    unless it ends on three sides where the landmark does, or the landmark is a board itself.
 
     Parameters
     ----------
@@ -131,29 +133,60 @@ def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> N
     has_outline = (coverage < MAY_RETURN_COVERAGE).any(axis=1)
     n_agreeing = agreeing.sum(axis=1)
     opaque = through.sum(axis=1) <= np.where(has_outline, _SEEN_THROUGH, _BESIDE_A_SLAB) * n_agreeing
-    return np.asarray(opaque & (n_agreeing >= other.sum(axis=1)) & _ends_at_outline(problem, state, agreeing))
+    pairs, ends, continues = _outline(problem, state, agreeing)
+    shown_outline = 0.25  # share of the outline in view that a frame must show
+    shown = (ends > 0) & (ends >= shown_outline * pairs)
+    good = opaque & (n_agreeing >= other.sum(axis=1)) & (ends >= continues).all(axis=0)
+    good &= ends.sum(axis=0) >= shown_outline * pairs.sum(axis=0)
+    enough_sides = 3
+    board = np.array(problem.settings.boards)[problem.class_index]
+    doubtful = np.flatnonzero(good & (shown.sum(axis=0) < enough_sides) & ~board)
+    good[doubtful] = ~_is_plain(problem.some(doubtful), state.images.phasor[doubtful], agreeing[doubtful])
+    return np.asarray(good, np.bool_)
 
 
-def _ends_at_outline(problem: Problem, state: State, agreeing: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether what agrees ends at the outline of the landmark, (m,).
+def _is_plain(problem: Problem, phasor: NDArray[np.complex128], agreeing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return whether a plane explains the pixels that agree with model images as well as these do, (m,).
+
+    In the image 1/z of a plane is linear, z the depth along the optical axis.
+    """
+    evidence, frame, sensor = problem.evidence, problem.frame, problem.evidence.sensor
+    weight = evidence.seen.weight[frame] * agreeing
+    own = np.sum(weight * range_residuals(phasor, evidence, frame) ** 2, axis=1)
+    z = np.where(agreeing, evidence.seen.range_m[frame], 1.0) * sensor.axis_cosine().ravel()
+    v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
+    columns = np.stack([np.ones(u.size), *(one.ravel() for one in sensor.tangents(u, v))])
+    weight = weight * (z**2 / sensor.axis_cosine().ravel()) ** 2
+    information = np.einsum("mk,ak,bk->mab", weight, columns, columns)
+    plane = np.linalg.pinv(information, hermitian=True) @ np.einsum("mk,ak->ma", weight / z, columns)[..., None]
+    cost = np.sum(weight * (1 / z - plane[..., 0] @ columns) ** 2, axis=1)
+    return np.asarray(cost <= own + DISAGREEMENT)
+
+
+def _outline(problem: Problem, state: State, agreeing: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Return how often what agrees could end at the outline of the landmark, ends and continues, (3, sides, m).
 
     A pixel that agrees is compared with the first one beyond the outline, along rows and columns, within two pixels: an
     edge may cross the one between. Beyond, nothing returns or something farther away (the surface ends), something from
-    the same depth (it continues), or something nearer (its edge is hidden). The surface is extended by its tangent
-    plane: along a row or column of an image 1/z of a plane is linear, z the depth along the optical axis.
+    the same depth (it continues), or something nearer (its edge is hidden). The landmark's surface is extended by its
+    tangent plane: along a row or column of an image 1/z of a plane is linear, z the depth along the optical axis.
     """
     sensor, seen, frame = problem.evidence.sensor, problem.evidence.seen, problem.frame
     shape, cosine = (-1, sensor.rows, sensor.cols), sensor.axis_cosine()
     coverage = state.images.coverage.reshape(shape)
     returned, absent = seen.returned[frame].reshape(shape), seen.not_returned[frame].reshape(shape)
-    z = np.where(returned, seen.range_m[frame].reshape(shape) * cosine, 1.0)
-    variance = cosine**2 / np.where(returned, seen.weight[frame].reshape(shape), 1.0)
+    range_m = seen.range_m[frame].reshape(shape)
+    z = np.where(returned, range_m * cosine, 1.0)
+    modelled_m = range_m - range_residuals(state.images.phasor, problem.evidence, frame).reshape(shape)
+    surface_z = np.where(returned, modelled_m * cosine, 1.0)
+    std_m = cosine / np.sqrt(np.where(returned, seen.weight[frame].reshape(shape), 1.0))
     inside, outside = agreeing.reshape(shape) & (coverage > MUST_RETURN_COVERAGE), coverage < MAY_RETURN_COVERAGE
     filled = inside & (coverage >= FILLED_COVERAGE)
-    counted = np.zeros((3, len(coverage)), np.int64)
+    sides = (1, 1), (1, -1), (2, 1), (2, -1)
+    counted = np.zeros((3, len(sides), len(coverage)), np.int64)
     # what continues a surface lies this near its tangent plane, noise apart; three times as far from a single pixel
     surface_m = 0.01
-    for axis, step in ((1, 1), (1, -1), (2, 1), (2, -1)):
+    for side, (axis, step) in enumerate(sides):
 
         def at(values: NDArray[Any], k: int, axis: int = axis, step: int = step) -> NDArray[Any]:
             """Return what is k pixels farther out, where that is in view; elsewhere what is at the border."""
@@ -161,14 +194,11 @@ def _ends_at_outline(problem: Problem, state: State, agreeing: NDArray[np.bool_]
             return np.take(values, np.clip(np.arange(n) + k * step, 0, n - 1), axis=axis)
 
         has_slope = filled & at(filled, -1)
-        rise = np.where(has_slope, 1 / z - 1 / at(z, -1), 0.0)
+        rise = np.where(has_slope, 1 / surface_z - 1 / at(surface_z, -1), 0.0)
         for k, first in ((1, at(outside, 1)), (2, at(outside, 2) & ~at(outside, 1))):
-            extended = 1 / np.maximum(1 / z + k * rise, 1e-3)
-            lever = np.where(has_slope, (k + 1) ** 2 + k**2, 1)
-            near = np.where(has_slope, 1, 3) * surface_m + 5 * np.sqrt(at(variance, k) + lever * variance)
+            extended = 1 / np.maximum(1 / surface_z + k * rise, 1e-3)
+            near = np.where(has_slope, 1, 3) * surface_m + 5 * at(std_m, k)
             pair, back, off = inside & first, at(returned, k), at(z, k) - extended
             ends, continues = pair & (at(absent, k) | (back & (off > near))), pair & back & (np.abs(off) <= near)
-            counted += np.array([one.sum(axis=(1, 2)) for one in (pair, ends, continues)])
-    pairs, ends_at, continues_at = counted
-    shown_outline = 0.25  # share of the outline in view that a frame must show
-    return np.asarray((ends_at >= continues_at) & (ends_at >= shown_outline * pairs))
+            counted[:, side] += np.array([one.sum(axis=(1, 2)) for one in (pair, ends, continues)])
+    return counted

@@ -22,7 +22,11 @@ from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, layers_of, pixels_of
 from phasemark.matcher.likelihood.auto_background import AutoBackground
-from phasemark.matcher.likelihood.background_estimate import NEAREST_WALL_M, estimate_surroundings
+from phasemark.matcher.likelihood.background_estimate import (
+    NEAREST_WALL_M,
+    estimate_surroundings,
+    part_of_background,
+)
 from phasemark.matcher.likelihood.bank_images import BankModel
 from phasemark.matcher.likelihood.floor_albedo import estimate_floors, fit_before_floors
 from phasemark.matcher.likelihood.images import VIEW
@@ -300,9 +304,22 @@ class LikelihoodMatcher:
         answers: list[Match] = []
         for k, found in enumerate(rank(self._setup.rules, fits, self._doubt(fits), bare, backgrounds)):
             one, search = slice(k, k + 1), self._search if backgrounds[k] is None else self._open_search
+            found = self._before_uncertain(backgrounds[k], evidence[one], found)
             mirrored = self._with_mirror(evidence[one], [found], search)
             answers.extend(self._with_shared_errors(frames[one], evidence[one], mirrored))
         return answers
+
+    def _before_uncertain(self, background: Background | None, evidence: Evidence, answer: Match) -> Match:
+        """Return an accepted answer whose covariance holds the uncertainty of the background that was estimated."""
+        if background is None or not answer.accepted or answer.covariance is None:
+            return answer
+        rules = self._setup.rules
+        view = np.array([getattr(answer, name) for name in VIEW])
+        class_index = list(rules.names).index(str(answer.class_name))
+        further = part_of_background(
+            self._rendered, evidence, class_index, view, self.free, background, self._setup.prior_std
+        )
+        return with_parts(rules, replace(answer, covariance=answer.covariance + further), {})
 
     def _doubt(self, fits: Fits) -> NDArray[np.float64]:
         """Return the costs of fits that just fail a χ² test with the noise as stated, (m,)."""
@@ -312,6 +329,8 @@ class LikelihoodMatcher:
     def _with_mirror(self, evidence: Evidence, answers: list[Match], search: Search) -> list[Match]:
         """Say of accepted answers whether their frames may be mirrored left to right, by the bounds of the cells."""
         accepted = np.array([k for k, answer in enumerate(answers) if answer.accepted], np.int64)
+        if not accepted.size:
+            return answers
         some, seen = [answers[k] for k in accepted], evidence.seen[accepted]
         dof = np.array([answer.dof for answer in some])
         # what an answer leaves to unknown things costs the other view, too

@@ -61,6 +61,8 @@ class DescentSettings:
         Where that alone returns light that one frame measures; None without a background.
     unknown_around : bool
         Whether unknown things may stand in view: what the landmark does not explain is then left out of the test.
+    boards : tuple of bool
+        Among unknown things, whether each class is flat.
     longest_step : float
         No step is longer, in natural units of 1 cm and 1°. Near a solution it should be short: where an edge crosses
         a pixel's border, slopes jump, and those of one side may lead far away on the other.
@@ -80,6 +82,7 @@ class DescentSettings:
     prior_std: tuple[float, ...] = ()
     returns_behind: NDArray[np.bool_] | None = None
     unknown_around: bool = False
+    boards: tuple[bool, ...] = ()
     longest_step: float = LONGEST_STEP
     around: ImageModel | None = None
     albedo_std: float = 0.0
@@ -247,9 +250,13 @@ class Problem:
         phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides
-            phasor = phasor - (theta[:, ALBEDO_COLUMN:] - 1) * images.slope[:, -1]
+            factor, own = theta[:, ALBEDO_COLUMN:], images.slope[:, -1]
+            phasor = phasor - (factor - 1) * own
             if self.evidence.on == "ranges":  # its light and the background's may cancel: that has no range
-                trusted = trusted & counts(images.phasor, images.intensity, sensor)
+                cancels = counts(factor * own, images.intensity, sensor) & ~counts(
+                    images.phasor, images.intensity, sensor
+                )
+                trusted = trusted & ~cancels
         return counts(phasor, images.intensity, sensor) & trusted
 
     def best_of_frames(self, state: State) -> NDArray[np.intp]:

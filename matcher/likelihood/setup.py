@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,6 +95,18 @@ class Setup:
         """Whether the bearing is estimated."""
         return "bearing_rad" in self.free
 
+    @cached_property
+    def boards(self) -> tuple[bool, ...]:
+        """Whether each class is flat, thinner than a fifth of its width and of its height."""
+        thickest = 0.2
+        found = []
+        for name in self.rules.names:
+            vertices = np.asarray(self.bank.mesh(name).vertices)
+            axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
+            across, *_ = extent = np.sort(np.ptp(vertices @ axes.T, axis=0))
+            found.append(bool(across < thickest * extent[1]))
+        return tuple(found)
+
     @property
     def height_and_tilt_are_known(self) -> bool:
         """Whether height, pitch and roll are those that were stated: none of them is estimated."""
@@ -152,6 +165,7 @@ class Scene:
             phasor,
             prior_std=setup.prior_std,
             unknown_around=setup.unknown,
+            boards=setup.boards if setup.unknown else (),
             returns_behind=returns,
             around=self.strips,
             albedo_std=0.0 if behind is None else setup.albedo_std,

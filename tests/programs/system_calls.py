@@ -11,6 +11,10 @@ from typing import Any
 from phasemark import PhasemarkError
 from phasemark.data.files import renames
 
+# Boolean operations on meshes start threads where there are several processors, and a fork waits for them forever.
+_PROCESSORS = sorted(os.sched_getaffinity(0))
+os.sched_setaffinity(0, {_PROCESSORS[os.getpid() % len(_PROCESSORS)]})
+
 CALLS = (
     "pwrite", "write", "fsync", "replace", "rename", "posix_fallocate", "ftruncate", "mkdir", "rmdir", "unlink",
     "chmod", "chown",
