@@ -108,20 +108,16 @@ class UsageError(PhasemarkError, ValueError):
     exit_code = 2
 
     @classmethod
-    def of_field(
-        cls, location: tuple[int | str, ...], kind: str, message: str, value: object, whole: str = ""
-    ) -> "UsageError":
+    def of_field(cls, location: tuple[int | str, ...], kind: str, message: str, value: object) -> "UsageError":
         """Put one finding of a pydantic ``ValidationError`` into one line: key, what would be right, value.
 
         Parameters
         ----------
         location, kind, message, value
             ``loc``, ``type``, ``msg`` and ``input`` of the first entry of the error's ``errors()``.
-        whole : str
-            The key to name when the finding is about the model as a whole.
         """
         of_key = location[-1:] == ("[key]",)  # the finding is about a key of a table, not about its value
-        key = ".".join(str(part) for part in (location[:-2] if of_key else location)) or whole
+        key = ".".join(str(part) for part in (location[:-2] if of_key else location))
         if kind == "extra_forbidden":
             return cls(f"unknown key '{key}'")
         if kind == "missing":

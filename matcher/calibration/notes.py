@@ -104,7 +104,7 @@ def observability_notes(free: Sequence[str], covariance: _Float, scale: _Float, 
 def pose_std_text(errors: PoseStd) -> str:
     """Return the errors of poses with their units."""
     heading, delta = np.degrees([errors.heading_rad, errors.delta_rad])
-    return f"{1e3 * errors.position_m:.0f} mm in place, {heading:.2g}° in heading, {delta:.2g}° in δ"
+    return f"{1e3 * errors.position_m:.3g} mm in place, {heading:.2g}° in heading, {delta:.2g}° in δ"
 
 
 def pose_std_note(estimated: PoseStd) -> str:

@@ -62,7 +62,6 @@ class Surroundings:
 def estimate_surroundings(
     frames: FilteredFrames,
     index: int = 0,
-    landmark_scale: float = 1.0,
     *,
     bearing_known: bool = True,
     tilt_known: bool = True,
@@ -75,8 +74,6 @@ def estimate_surroundings(
         Filtered frames.
     index : int
         Which of them is looked at.
-    landmark_scale : float
-        How much brighter the landmark is than its model: albedos count relative to it.
     bearing_known : bool
         Whether the mount points at the landmark. Otherwise the azimuth of what is near takes its place: the wall is
         perpendicular to the line of sight, and a bearing of 4° ignored would move its two ends by 3 %.
@@ -128,7 +125,7 @@ def estimate_surroundings(
     albedo = floor_albedo = _USUAL_ALBEDO
     if frames.amplitude_e is not None:
         # a plane whose normal is θ off the line of sight: |S| = ρ cos θ / r²
-        bright = frames.amplitude_e[index] / (sensor.contrast * sensor.signal_e) * ranges**2 / landmark_scale
+        bright = frames.amplitude_e[index] / (sensor.contrast * sensor.signal_e) * ranges**2
         albedo = _albedo_of((bright / facing)[pure & ~short])
         floor_albedo = albedo if not on_floor.any() else _albedo_of((bright / np.maximum(down, 1e-3))[on_floor])
     pure = pure | (on_floor & _inner(far | on_floor))
