@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from builders import strangers
+import trimesh
+from builders import block, strangers
 from damaged_frames import DAMAGE, check_damaged
 from hypothesis import HealthCheck, given, settings
+from scipy import stats
 
 from phasemark import UsageError
 from phasemark.data import BankPlan, build_bank
+from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.accuracy.trials import Trials, TrialSetup, noisy_frames, run_trials
@@ -423,6 +426,24 @@ def test_an_automatic_background_knows_how_well_it_knows_a_view_above_a_floor(ma
         assert ratio.value - z * (ratio.high - ratio.value) <= 1.3
     assert summary.nees.value - z * (summary.nees.high - summary.nees.value) <= 1.3
     assert summary.coverage.high >= 0.92
+
+
+def test_a_height_whose_cost_is_flat_to_one_side_is_not_claimed(tmp_path):
+    """Above a floor a bracket's height may be 1.5 mm more at the same cost, and not 0.2 mm less."""
+    plates = block((-0.075, -0.045), (-0.13, 0.13), (-0.15, 0.15)), block((-0.06, 0.12), (-0.13, -0.1), (-0.15, 0.15))
+    foot = block((-0.06, 0.06), (-0.1, 0.1), (-0.15, -0.12))
+    trimesh.boolean.union([*plates, foot], engine="manifold").export(tmp_path / "bracket.stl")
+    mesh = MeshPlan(name="bracket", path=str(tmp_path / "bracket.stl"), unit="m")
+    plan = BankPlan(meshes=(mesh,), distance_m="1.0:1.3:0.05", delta_deg="240:300:6", layout="full")
+    truth, floor, rng = np.array([1.1621, 4.68995, 0.0112, 0.00016]), Background(floor_m=0.25), np.random.default_rng(0)
+    with build_bank(plan, workers=1) as bank:
+        matcher = Matcher(bank, "refine", free=VIEW[:4], background=floor, height_std_m=0.02, workers=1)
+        image = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8).render(*truth, background=floor)
+        matches = [matcher.match(kalman_filter(capture(image, SENSOR, rng=rng, n_frames=20)))[0] for _ in range(8)]
+    for match in matches:
+        assert match.accepted
+        error = np.array([getattr(match, name) for name in VIEW[:4]]) - truth
+        assert error @ np.linalg.solve(match.covariance, error) < stats.chi2.isf(1e-3, 4)
 
 
 def test_an_estimated_floor_leaves_height_and_pitch_less_certain(bank_of_two, renderers):

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from phasemark.matcher.estimate.acceptance import is_acceptable
 from phasemark.matcher.estimate.fits import Fits, best_of_frame
 from phasemark.matcher.information import covariance_of
-from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import Scene
@@ -31,15 +30,17 @@ rise that is expected there it does not."""
 def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Return fits with covariances as wide as the likelihood is; only the best of each frame, if it would be accepted.
 
-    Distance, δ and bearing are moved by four standard deviations to both sides, alone and with the others. Where the
-    cost rises by less than half of what is expected, the part of that parameter is the second moment of its profile
-    likelihood, along the valley. Nothing is done where pixels are narrow enough for slopes to hold, nor with a robust
-    loss, which is flat far away by design.
+    Each parameter is moved by four standard deviations to both sides, alone and with the others. Where the cost rises
+    by less than half of what is expected, the part of that parameter is the second moment of its profile likelihood,
+    along the valley. Nothing is done where slopes hold, as those by distance, δ and bearing do where pixels are narrow,
+    nor with a robust loss, which is flat far away by design.
     """
-    if scene.setup.huber is not None or scene.setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD:
+    setup = scene.setup
+    slopes_hold = setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD and setup.height_and_tilt_are_known
+    if setup.huber is not None or slopes_hold:
         return fits
     best = best_of_frame(fits)
-    best = best[[is_acceptable(scene.setup.rules, fits, int(k)) for k in best]]
+    best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]]
     if not best.size:
         return fits
     own = fits[best]
@@ -59,10 +60,10 @@ def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float6
     known = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
     if not known.size:
         return wide
-    own = np.flatnonzero(problem.columns <= VIEW.index("bearing_rad"))
-    information, spread = covariance_of(covariance[known], 1 / problem.scale[:p]), covariance[known][:, own]
-    along = spread / np.sqrt(spread[:, np.arange(len(own)), own])[..., None]
-    alone = along * (np.arange(p) == own[:, None])
+    each = np.arange(p)
+    information, spread = covariance_of(covariance[known], 1 / problem.scale[:p]), covariance[known]
+    along = spread / np.sqrt(spread[:, each, each])[..., None]
+    alone = along * np.eye(p)
     ways = _ASKED_SIGMA * np.stack([along, alone, -along, -alone], axis=1)  # (k, 4, parameters moved, p)
     expected = np.einsum("kwap,kpq,kwaq->kwa", ways, information, ways)
     if problem.with_albedo:  # which follows
@@ -78,8 +79,8 @@ def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float6
     row, k = np.nonzero(doubtful)
     if not row.size:
         return wide
-    moments = _valley(problem, state, known[row], own[k], along[row, k])[:, :p, :p]
-    for solution, d, moment in zip(known[row], own[k], moments, strict=True):
+    moments = _valley(problem, state, known[row], k, along[row, k])[:, :p, :p]
+    for solution, d, moment in zip(known[row], k, moments, strict=True):
         one = wide[solution]
         if moment[d, d] > one[d, d]:  # what is left of the others where this parameter is known, and the valley
             wide[solution] = one - np.outer(one[:, d], one[:, d]) / one[d, d] + moment
