@@ -115,8 +115,9 @@ def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> N
     """Return whether solutions among unknown things show a landmark that stands where the model has it, (m,).
 
     Things before a landmark hide it, but none is seen through it, and what continues beyond its outline is none: on
-    each of its four sides it must end as often as it continues. A plane face may be that of any board, wall or post,
-    unless it ends on three sides where the landmark does, or the landmark is a board itself.
+    each of its four sides it must end as often as it continues, unless it continues across little of that side. A plane
+    face may be that of any board, wall or post, unless it ends on three sides where the landmark does, or the landmark
+    is a board itself.
 
     Parameters
     ----------
@@ -136,8 +137,9 @@ def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> N
     pairs, ends, continues = _outline(problem, state, agreeing)
     shown_outline = 0.25  # share of the outline in view that a frame must show
     shown = (ends > 0) & (ends >= shown_outline * pairs)
-    good = opaque & (n_agreeing >= other.sum(axis=1)) & (ends >= continues).all(axis=0)
-    good &= ends.sum(axis=0) >= shown_outline * pairs.sum(axis=0)
+    good = opaque & (n_agreeing >= other.sum(axis=1)) & (ends.sum(axis=0) >= shown_outline * pairs.sum(axis=0))
+    good &= ((ends >= continues) | (continues < shown_outline * pairs)).all(axis=0)
+    good &= ends.sum(axis=0) >= continues.sum(axis=0)
     enough_sides = 3
     board = np.array(problem.settings.boards)[problem.class_index]
     doubtful = np.flatnonzero(good & (shown.sum(axis=0) < enough_sides) & ~board)
