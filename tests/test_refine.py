@@ -447,7 +447,7 @@ def test_a_height_whose_cost_is_flat_to_one_side_is_not_claimed(tmp_path):
 
 
 def test_an_estimated_floor_leaves_height_and_pitch_less_certain(bank_of_two, renderers):
-    """Joint information of view, albedo, wall and floor, by differences of images."""
+    """Joint information of view, wall and floor, by differences of images."""
     free, prior = ("distance_m", "delta_rad", "height_m", "pitch_rad"), (math.inf, math.inf, 0.02, 0.03)
     truth, cone = Background(wall_m=2.6, floor_m=0.2), renderers["cone"]
     image = cone.render(1.0, 0.5, 0.0, 0.01, pitch_rad=0.01, background=truth)

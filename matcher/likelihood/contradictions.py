@@ -111,8 +111,12 @@ def whole_cost(problem: Problem, state: State) -> tuple[NDArray[np.float64], NDA
     return np.asarray(total), np.asarray(wrong.any(axis=1) | dark, np.bool_)
 
 
-def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return whether solutions among unknown things show a landmark that stands where the model has it, (m,).
+def stands_out(
+    problem: Problem, state: State, outlying: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return whether solutions among unknown things show a landmark that stands where the model has it, and no other.
+
+    Both are (m,); the second is True where something else than the landmark may be seen.
 
     Things before a landmark hide it, but none is seen through it, and what continues beyond its outline is none: on
     each of its four sides it must end as often as it continues, unless it continues across little of that side. A plane
@@ -142,9 +146,9 @@ def stands_out(problem: Problem, state: State, outlying: NDArray[np.bool_]) -> N
     good &= ends.sum(axis=0) >= continues.sum(axis=0)
     enough_sides = 3
     board = np.array(problem.settings.boards)[problem.class_index]
-    doubtful = np.flatnonzero(good & (shown.sum(axis=0) < enough_sides) & ~board)
-    good[doubtful] = ~_is_plain(problem.some(doubtful), state.images.phasor[doubtful], agreeing[doubtful])
-    return np.asarray(good, np.bool_)
+    doubtful, plain = np.flatnonzero(good & (shown.sum(axis=0) < enough_sides) & ~board), np.zeros(len(good), np.bool_)
+    plain[doubtful] = _is_plain(problem.some(doubtful), state.images.phasor[doubtful], agreeing[doubtful])
+    return np.asarray(good, np.bool_), plain
 
 
 def _is_plain(problem: Problem, phasor: NDArray[np.complex128], agreeing: NDArray[np.bool_]) -> NDArray[np.bool_]:

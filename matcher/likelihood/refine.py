@@ -216,7 +216,7 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
         prior=prior,
         covariance=covariance,
         information=np.where(np.isfinite(information), information, eliminated(state.sums.information, p)),
-        std_without_one=without_one,
+        std_without_one=np.where(pixels.plain[:, None], np.inf, without_one),  # what a plane shows has no class
     )
 
 
@@ -266,7 +266,7 @@ def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
 
 
 class _Pixels(NamedTuple):
-    """Pixels of each solution by what they say, (m, pixels) bool, and whether each stands out, (m,)."""
+    """Pixels of each solution by what they say, (m, pixels) bool; whether each stands out and is but a plane, (m,)."""
 
     compared: NDArray[np.bool_]
     wrong: NDArray[np.bool_]
@@ -274,10 +274,11 @@ class _Pixels(NamedTuple):
     unexplained: NDArray[np.bool_]
     explained: NDArray[np.bool_]
     stands_out: NDArray[np.bool_]
+    plain: NDArray[np.bool_]
 
     def among(self, some: NDArray[np.bool_]) -> _Pixels:
         """Return those among some pixels."""
-        return self._replace(**{name: getattr(self, name) & some for name in self._fields if name != "stands_out"})
+        return self._replace(**{name: getattr(self, name) & some for name in self._fields[:-2]})
 
 
 def _further_cost(pixels: _Pixels) -> NDArray[np.float64]:
@@ -335,14 +336,16 @@ def _judged_pixels(problem: Problem, state: State, near: NDArray[np.intp], covar
     undecided = returned & ~fitted & ~wrong
     if not problem.settings.unknown_around:
         stands = np.ones(len(state.theta), np.bool_)
-        return _Pixels(fitted, wrong, undecided, np.zeros_like(fitted), fitted, stands)
+        return _Pixels(fitted, wrong, undecided, np.zeros_like(fitted), fitted, stands, ~stands)
     outlying = outlying_pixels(problem, state)
     wrong, undecided = wrong | (undecided & outlying), undecided & ~outlying
+    stands, plain = stands_out(problem, state, outlying)
     return _Pixels(
         compared=fitted,
         wrong=wrong,
         undecided=undecided,
         unexplained=(fitted & outlying) | (wrong & returned),
         explained=fitted & ~outlying,
-        stands_out=stands_out(problem, state, outlying),
+        stands_out=stands,
+        plain=plain,
     )

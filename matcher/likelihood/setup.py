@@ -103,8 +103,8 @@ class Setup:
         for name in self.rules.names:
             vertices = np.asarray(self.bank.mesh(name).vertices)
             axes = np.linalg.svd(vertices - vertices.mean(axis=0), full_matrices=False)[2]
-            across, *_ = extent = np.sort(np.ptp(vertices @ axes.T, axis=0))
-            found.append(bool(across < thickest * extent[1]))
+            thickness, width, _ = np.sort(np.ptp(vertices @ axes.T, axis=0))
+            found.append(bool(thickness < thickest * width))
         return tuple(found)
 
     @property
