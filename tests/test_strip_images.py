@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+import trimesh
 from random_parts import random_part
 
 from phasemark.data import BankPlan, build_bank
@@ -91,6 +92,18 @@ def test_images_do_not_depend_on_what_was_asked_before(part_files):
             one = model.images(c[k : k + 1], view[k : k + 1], FREE)
             np.testing.assert_array_equal(one.phasor[0], at_once.phasor[k])
             np.testing.assert_array_equal(one.slope[0], at_once.slope[k])
+
+
+def test_a_bank_may_begin_where_an_edge_of_a_panel_reaches_the_lens_between_its_angles(tmp_path):
+    panel = trimesh.creation.box((0.01, 0.6, 0.5))
+    panel.export(tmp_path / "panel.ply")
+    view = np.zeros((4, len(VIEW)))
+    view[:, 0], view[:, 1] = (0.3, 0.305, 0.31, 0.33), np.radians((89.4, 90.5, 269.6, 60.3))
+    with bank_of([tmp_path / "panel.ply"], "vl53l8cx-8x8", distance_m="0.3:0.5:0.02", delta_deg="0:356:4") as bank:
+        made = StripModel(bank, 2).images(np.zeros(4, np.int64), view, ())
+        apart = Renderer(panel, bank.sensor, albedo=0.8).render_views(Views.broadcast(view[3:, 0], view[3:, 1]))
+    assert np.isfinite(made.phasor).all()
+    np.testing.assert_allclose(made.phasor[3:], apart.phasor.reshape(1, -1), atol=0.03 * abs(apart.phasor).max())
 
 
 def test_a_factored_bank_gives_the_images_of_a_full_one():

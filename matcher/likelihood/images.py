@@ -18,6 +18,8 @@ LEVEL_VIEW = VIEW[:4]
 """What the view of a level camera is made of."""
 TILT = slice(4, 6)
 """Columns of pitch and roll."""
+BEFORE_LENS_M = 5e-3
+"""Smallest gap between a landmark and the lens."""
 
 
 @dataclass(frozen=True, eq=False)

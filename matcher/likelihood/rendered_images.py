@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.frequencies import renderer_of
-from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
+from phasemark.matcher.likelihood.images import BEFORE_LENS_M, VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.view_cache import ViewCache
 from phasemark.matcher.pixel_agreement import MAY_RETURN_COVERAGE
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
@@ -24,8 +24,8 @@ from phasemark.render.view import Footprint
 
 STEP = 1e-5
 """Width of a difference, metres or radians: see :meth:`~phasemark.render.Renderer.jacobian`."""
-_BEFORE_LENS_M, _BEFORE_WALL_M = 5e-3, 1e-3
-"""Smallest gaps between a landmark and the lens, and the wall."""
+_BEFORE_WALL_M = 1e-3
+"""Smallest gap between a landmark and the wall."""
 
 
 class RenderedModel(ImageModel):
@@ -133,7 +133,7 @@ class RenderedModel(ImageModel):
         beyond_bank = 1.25  # without a wall a view may be this many times as far as the bank's last distance
         before_wall = wall_m - self._footprint.reach_m(delta_rad) - _BEFORE_WALL_M
         farthest = np.where(np.isinf(wall_m), beyond_bank * self._bank_end_m, before_wall)
-        return self._footprint.nearest_m(delta_rad, _BEFORE_LENS_M), farthest
+        return self._footprint.nearest_m(delta_rad, BEFORE_LENS_M), farthest
 
     def images(self, class_index: NDArray[np.int64], view: NDArray[np.float64], free: Sequence[str]) -> ModelImages:
         """Render the views, and with them how they change.
@@ -314,7 +314,7 @@ class RenderedModel(ImageModel):
         Floors are estimated, and heights are tried. So are sides of a landmark whose far end then reaches a wall.
         """
         farthest_m, circle_m = views.distance_m.max(), self._footprint.radius_m
-        may_be_cut = max(farthest_m, circle_m + _BEFORE_LENS_M) + circle_m + _BEFORE_WALL_M > self._wall_m.min()
+        may_be_cut = max(farthest_m, circle_m + BEFORE_LENS_M) + circle_m + _BEFORE_WALL_M > self._wall_m.min()
         if not self._floors and not may_be_cut:
             return self._backgrounds[0] if self._frame is None else self._behind(which)
         nearest, farthest = self.limits(views.delta_rad, which)

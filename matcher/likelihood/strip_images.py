@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from phasemark.data import Bank
 from phasemark.matcher.frequencies import OneFrequencyBank
-from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
+from phasemark.matcher.likelihood.images import BEFORE_LENS_M, VIEW, ImageModel, ModelImages
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
@@ -117,7 +117,8 @@ class StripModel(ImageModel):
     def _kept(self, class_index: NDArray[np.int64], corners: NDArray[np.int64]) -> list[_Kept]:
         """Return where the upper and the lower strips at (m, 4, 2) nodes are kept, and render those that are missing.
 
-        The upper rows see no lower part, and a round upper part looks alike from all sides.
+        The upper rows see no lower part, and a round upper part looks alike from all sides. Where the bank begins
+        inside the circle of a flat landmark, an edge may reach the lens between its angles: these nodes are a bit farther.
         """
         middle, rows = self._upper.pixels // self._strips.cols, self._strips.rows
         found: list[_Kept] = []
@@ -131,8 +132,10 @@ class StripModel(ImageModel):
                         own = c[:, 0] == k
                         wanted[i[own], j[own]] = True
                         at_d, at_a = np.nonzero(wanted & (kept.slot[k] < 0))
-                        views = Views.broadcast(self._distance[at_d], self._delta[at_a])
-                        kept.add(k, at_d, at_a, self._renderers[k].render_views(views, rows=part))
+                        distance, delta, renderer = self._distance[at_d], self._delta[at_a], self._renderers[k]
+                        outside = renderer.footprint.nearest_m(delta, BEFORE_LENS_M)
+                        views = Views.broadcast(np.maximum(distance, outside), delta)
+                        kept.add(k, at_d, at_a, renderer.render_views(views, rows=part))
                 found.append((kept.slot[c, i, j], kept.values))
         return found
 
