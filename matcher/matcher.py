@@ -29,14 +29,9 @@ from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.scene_models import relative_poses
 from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.likelihood_matcher import (
-    BEARING_STD_RAD,
-    TILT_STD_RAD,
-    LikelihoodMatcher,
-    Pixels,
-)
+from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.likelihood.setup import check_free
+from phasemark.matcher.likelihood.setup import BEARING_STD_RAD, TILT_STD_RAD, Pixels, check_free, setup_of
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors, check_systematic
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
@@ -239,10 +234,9 @@ class Matcher:
             self.free = self._by_evidence[0].free
             return
         if method == "refine":
-            kind = {"on": "ranges", "reported": True} if on == "reported" else {}
-            own = {"systematic": self._systematic, "policy": policy or DEFAULT_POLICY, **kind}
-            matching = LikelihoodMatcher(bank, **{**arguments, **own})
-            self._method, self.free = matching, matching.free
+            told: dict[str, Any] = {**self.options, **stated, "false_alarm": false_alarm}
+            setup = setup_of(bank, **told, policy=policy or DEFAULT_POLICY)
+            self._method, self.free = LikelihoodMatcher(setup, self._systematic, workers), setup.free
             return
         if systematic is not None or policy is not None:
             raise UsageError("'systematic' and 'policy' belong to method 'refine', not 'nearest'")
@@ -322,7 +316,7 @@ class Matcher:
         mesh = self.bank.mesh(class_name)
         own = self._by_evidence[0] if self._by_evidence else self
         if own.method == "refine" and isinstance(own._method, LikelihoodMatcher):
-            return own._method.renderer(self.bank.classes.index(class_name))
+            return own._method.scenes.rendered.renderer(self.bank.classes.index(class_name))
         return Renderer(mesh, self.bank.sensor, albedo=float(mesh.metadata["albedo"]))
 
     @property
@@ -368,7 +362,7 @@ class Matcher:
         if self.options["on"] == "reported":
             frames = frames.with_chip_error()
         found = self._method.track(frames if self._one is None else self._of_one_frequency(frames, self._one), near)
-        return with_parts(self._method.rules, found, {name: near[0].systematic[name] for name in near[0].systematic})
+        return with_parts(self._method.setup.rules, found, dict(near[0].systematic))
 
     def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
         """Match histograms of several known poses as those of one landmark that is seen from all of them.

@@ -11,8 +11,9 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import export_mesh
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.scenes import Scenes
+from phasemark.matcher.likelihood.setup import setup_of
 from phasemark.matcher.nearest.cells import CellBounds
 from phasemark.render import Background, Renderer, Views, capture, preset
 from phasemark.render.phasor_images import wrap_difference_m
@@ -77,7 +78,7 @@ def test_bounds_of_wide_pixels_hold_at_any_bearing_within_half_a_column(tmp_path
     distance, delta, rng = drawn(n, 4, 0.85, 1.15)
     with build_bank(BankPlan(meshes=(mesh,), sensor="vl53l5cx-8x8", **GRIDS[5])) as bank:
         bearing = rng.uniform(-0.5, 0.5, n) * bank.sensor.pixel_rad
-        cells = LikelihoodMatcher(bank)._search.cells
+        cells = Scenes(setup_of(bank), workers=1).search.cells
         image = Renderer(bank.mesh("prism"), bank.sensor, albedo=0.8).render(distance, delta, bearing)
     seen = Evidence.from_frames(kalman_filter(capture(image, image.sensor, rng=rng, n_frames=50)), "ranges").seen
     i = np.abs(distance[:, None] - cells.distance_m).argmin(axis=1)

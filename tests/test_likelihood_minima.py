@@ -50,7 +50,7 @@ def frames_of(bank, name, views, exposures, seed, background=None):
 def scene_and_evidence(matcher, frames):
     """Return what a matcher compares frames with, and the frames as it sees them."""
     evidence = Evidence.from_frames(matcher.read_out(frames).without_offset().with_pooled_noise(), "ranges")
-    return matcher._method._scene, evidence
+    return matcher._method.scenes.stated, evidence
 
 
 def starts_of(class_index, view, frame=None):

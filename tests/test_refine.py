@@ -31,6 +31,8 @@ from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
 from phasemark.matcher.likelihood.problem import DescentSettings, Problem
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.likelihood.scenes import Scenes
+from phasemark.matcher.likelihood.setup import setup_of
 from phasemark.matcher.likelihood.uncertainty import std_without_one_pixel, view_covariance
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE
 from phasemark.render import Background, Frames, Renderer, Views, capture, predicted_range_std, preset
@@ -369,13 +371,13 @@ def test_each_candidate_has_the_wall_the_limits_and_the_search_of_its_frame(bank
     np.testing.assert_array_equal(problem.clipped(np.repeat(far, 3, axis=0), np.arange(3))[:, 0], farthest[frame])
     assert problem.some(np.array([1])).clipped(far.copy(), np.arange(1))[0, 0] == farthest[0]
 
-    method = LikelihoodMatcher(bank, free=VIEW[:2])
-    cells = [method._cells(background_of(bank, wall)) for wall in walls]
-    search = method._search.before(*cells).of_frames(frame)
+    scenes = Scenes(setup_of(bank, free=VIEW[:2]), workers=1)
+    cells = [scenes.cells(background_of(bank, wall)) for wall in walls]
+    search = scenes.search.before(*cells).of_frames(frame)
     assert [search.cells_of(k) for k in range(3)] == [cells[k] for k in frame]
     found = search.starts(evidence.seen[frame], np.full(3, 300.0))
     for k, own in enumerate(frame):
-        alone = method._search.before(cells[own]).starts(evidence.seen[np.array([own])], np.full(1, 300.0))
+        alone = scenes.search.before(cells[own]).starts(evidence.seen[np.array([own])], np.full(1, 300.0))
         np.testing.assert_array_equal(found.view[found.frame == k], alone.view)
 
 
@@ -387,7 +389,7 @@ def test_fewer_frames_are_matched_together_where_images_are_large(bank, renderer
         TrialSetup(),
         np.random.default_rng(3),
     )
-    matcher = LikelihoodMatcher(bank, free=VIEW[:2], workers=1)
+    matcher = LikelihoodMatcher(setup_of(bank, free=VIEW[:2]), workers=1)
     expected, sizes, match = matcher.match(frames), [], matcher._match_stated
     monkeypatch.setattr(matcher, "_match_stated", lambda part: sizes.append(len(part)) or match(part))
     monkeypatch.setattr("phasemark.matcher.likelihood.likelihood_matcher._PIXELS_AT_ONCE", 2 * 256 * 2**2 + 1)

@@ -21,11 +21,11 @@ from phasemark.matcher.estimate.fits import Fits
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.likelihood.background_estimate import fit_background
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.likelihood_matcher import ROBUST_FROM
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import Candidates, costs_at, refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.setup import ROBUST_FROM
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.pixel_agreement import counts
 from phasemark.render import Background, Renderer, Sensor

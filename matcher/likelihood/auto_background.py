@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,10 +19,10 @@ from phasemark.matcher.likelihood.descent import CLOSE_BY_RAD
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.refine import refine
-from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
+from phasemark.matcher.likelihood.scenes import Scenes
 from phasemark.matcher.likelihood.search import are_doubtful, fit_views, search_views
-from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.likelihood.valleys import with_valleys
 from phasemark.render import Background
 from phasemark.render.view import delta_period_rad
@@ -34,7 +33,6 @@ _WALLS_BEYOND_M = 0.5, 1.0, 2.0, 4.0
 """Distances behind the landmark at which a wall is tried where no pixel sees the background alone."""
 
 
-_SceneOf = Callable[[Sequence[Background]], Scene]
 _Standing = tuple[list[Background | None], Fits]
 """What stands behind the landmark in each of n frames, and their fits before it."""
 
@@ -51,26 +49,15 @@ class AutoBackground:
     bare : (n,) float64
         Cost of a scene without a landmark.
     setup : Setup
-    rendered : RenderedModel
-        Renders the landmarks before any background.
-    scene : callable
-        Returns the scene of the backgrounds of some frames (empty: there is none), whose search leaves out what sees
-        the background.
-    whole_scene : callable
-        Returns one whose search compares all pixels, over all bearings, since what was taken for background may be
-        landmark: images of the bank are made before each background.
-    open_scene : callable
-        Returns the scene without a background whose search leaves open whether there is one.
+    scenes : Scenes
+        Before any background.
     """
 
     frames: FilteredFrames
     evidence: Evidence
     bare: NDArray[np.float64]
     setup: Setup
-    rendered: RenderedModel
-    scene: _SceneOf
-    whole_scene: _SceneOf
-    open_scene: Callable[[], Scene]
+    scenes: Scenes
 
     def search(self) -> _Standing:
         """Return the background of each frame, and what explains the frames before them."""
@@ -96,7 +83,7 @@ class AutoBackground:
         # 5  look how far the answers may be off
         parts = []
         for which in _without_and_with(backgrounds):
-            scene, some = self.scene(_standing(backgrounds, which)), self.evidence[which]
+            scene, some = self.scenes.before(_standing(backgrounds, which)), self.evidence[which]
             own = with_valleys(scene, some, _of_frames(fits, which))
             parts.append(_numbered(with_profiles(scene, some, own), which))
         return backgrounds, Fits.joined(parts)
@@ -121,12 +108,12 @@ class AutoBackground:
             seen, behind = some.seen, _standing(backgrounds, which)
             if behind:
                 seen = without_background(seen, [around[k] for k in which])
-            fits = search_views(self.scene(behind), some, seen, self.bare[which])
+            fits = search_views(self.scenes.before(behind), some, seen, self.bare[which])
             parts.append(_numbered(fits, which))
             doubtful = np.flatnonzero(are_doubtful(self.setup, fits, len(which)))
             if not behind and doubtful.size:  # each pixel at an edge may see a background that none sees alone
                 few, again = some[doubtful], which[doubtful]
-                fits = search_views(self.open_scene(), few, few.seen, self.bare[again])
+                fits = search_views(self.scenes.open(), few, few.seen, self.bare[again])
                 parts.append(_numbered(fits, again))
         return backgrounds, Fits.joined(parts)
 
@@ -141,12 +128,12 @@ class AutoBackground:
 
     def _leaves_room(self, background: Background) -> bool:
         """Return True if a landmark has a place between the lens and a wall."""
-        nearest, farthest = self.rendered.with_background(background).limits(self.setup.bank.delta_rad)
+        nearest, farthest = self.scenes.rendered.with_background(background).limits(self.setup.bank.delta_rad)
         return bool((nearest < farthest).all())
 
     def _searched_together(self, which: NDArray[np.int64], backgrounds: list[Background | None]) -> Fits:
         """Search frames with their backgrounds in the images of the bank."""
-        some, scene = self.evidence[which], self.whole_scene(_standing(backgrounds, which))
+        some, scene = self.evidence[which], self.scenes.whole_before(_standing(backgrounds, which))
         return _numbered(search_views(scene, some, some.seen, self.bare[which]), which)
 
     def _other_angles(self, which: NDArray[np.int64], backgrounds: list[Background | None], fits: Fits) -> Fits:
@@ -160,7 +147,7 @@ class AutoBackground:
         period = np.array([delta_period_rad(self.setup.rules.symmetry[c]) for c in own.class_index[source]])
         view = own.view[source]
         view[:, 1] += np.tile(np.arange(1, n), len(best)) * period / n
-        scene, some = self.scene(_standing(backgrounds, which)), self.evidence[which]
+        scene, some = self.scenes.before(_standing(backgrounds, which)), self.evidence[which]
         return _numbered(fit_views(scene, some, replace(own[source], view=view)), which)
 
     def _with_better_backgrounds(
@@ -196,7 +183,7 @@ class AutoBackground:
             which, moved, starts = self._moved_backgrounds(which, *found)
             if not which.size:
                 break
-            some, scene = self.evidence[which], self.scene(_standing(moved, which))
+            some, scene = self.evidence[which], self.scenes.before(_standing(moved, which))
             settings = replace(scene.settings(), look_beside_rad=CLOSE_BY_RAD)
             again = refine(scene.final, some, starts, settings)
             before = least_of_frame(found[1], len(self.frames))[which]
@@ -229,7 +216,9 @@ class AutoBackground:
                 continue
             best = fits[own[np.argsort(fits.cost[own], kind="stable")][:MOST_REFINED]]
             one, class_index = self.evidence[k : k + 1], int(best.class_index[0])
-            found, view = fit_background(self.rendered, one, class_index, best.view[0], self.setup.free, background)
+            found, view = fit_background(
+                self.scenes.rendered, one, class_index, best.view[0], self.setup.free, background
+            )
             if found == background or not self._leaves_room(found):
                 continue
             best.view[0] = view

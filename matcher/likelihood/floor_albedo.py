@@ -12,7 +12,8 @@ from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
-from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.likelihood.scenes import Scene
+from phasemark.matcher.likelihood.setup import Setup
 from phasemark.render import Background
 
 __all__ = ["Floors", "estimate_floors", "fit_before_floors"]

@@ -18,7 +18,7 @@ from phasemark.matcher.estimate.fits import Fits, best_of_frame
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.likelihood.setup import Scene
+from phasemark.matcher.likelihood.scenes import Scene
 from phasemark.matcher.match import TOLERATED_SIGMA
 from phasemark.matcher.nearest.grid import is_in_range
 from phasemark.render.view import delta_period_rad

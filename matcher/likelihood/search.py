@@ -28,7 +28,8 @@ from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import DescentSettings
 from phasemark.matcher.likelihood.refine import Candidates, costs_at, refine, slid
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.likelihood.scenes import Scene
+from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.nearest.bank_minima import CostOf, Known, Starts
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD

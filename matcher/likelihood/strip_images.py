@@ -117,8 +117,8 @@ class StripModel(ImageModel):
     def _kept(self, class_index: NDArray[np.int64], corners: NDArray[np.int64]) -> list[_Kept]:
         """Return where the upper and the lower strips at (m, 4, 2) nodes are kept, and render those that are missing.
 
-        The upper rows see no lower part, and a round upper part looks alike from all sides. Where the bank begins
-        inside the circle of a flat landmark, an edge may reach the lens between its angles: these nodes are a bit farther.
+        The upper rows see no lower part, and a round upper part looks alike from all sides. Where a bank begins inside
+        the circle of a flat landmark, an edge may reach the lens between two of its angles: these nodes are farther.
         """
         middle, rows = self._upper.pixels // self._strips.cols, self._strips.rows
         found: list[_Kept] = []

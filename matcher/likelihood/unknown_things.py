@@ -11,7 +11,8 @@ from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_f
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
-from phasemark.matcher.likelihood.setup import Scene, Setup
+from phasemark.matcher.likelihood.scenes import Scene
+from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.pixel_agreement import beside
 
 __all__ = ["fit_without_borders"]
@@ -22,9 +23,12 @@ def fit_without_borders(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
 
     They may see a little of it too, at the sides of the landmark, where a wrong range turns the view most. Views of
     one frame are compared on the same pixels: those that are beside something else in none of them. How pixels scatter
-    among unknown things is known less well than otherwise: covariances grow with the χ² found.
+    among unknown things is known less well than otherwise: covariances grow with the χ² found. Where none are expected,
+    and of zones, which show one surface each, fits are left as they are.
     """
     setup = scene.setup
+    if not setup.unknown or setup.reports_one_surface:
+        return fits
     policy, model = setup.policy, scene.final
     least = least_of_frame(fits, len(evidence.weight))
     close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + policy.margin_cost)

@@ -16,7 +16,7 @@ from phasemark.matcher.estimate.fits import Fits, best_of_frame
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.residuals import Evidence
-from phasemark.matcher.likelihood.setup import Scene
+from phasemark.matcher.likelihood.scenes import Scene
 from phasemark.matcher.likelihood.uncertainty import step_of_others
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 

@@ -244,9 +244,9 @@ def costs_of(
     """Return what the matcher's own cost function makes of classes and views: cost there, and after a descent."""
     method = matcher._method
     assert isinstance(method, LikelihoodMatcher)
-    setup = method._setup
+    setup = method.setup
     behind = [SCENES[case.setting]] if case.setting in SCENES else []
-    scene = method._scene_before(behind) if method._auto else method._scene
+    scene = method.scenes.before(behind) if setup.auto else method.scenes.stated
     evidence = Evidence.from_frames(matcher.read_out(frames).without_offset().with_pooled_noise(), setup.on)
     texts = []
     for name, view in views:
