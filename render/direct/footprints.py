@@ -103,13 +103,20 @@ def cells_per_zone(sensor: Sensor) -> tuple[int, int]:
     most_refined = 5
 
     def cells(zones: int, scale: float) -> int:
-        least = next((n for most, n in _CELLS.items() if zones <= most), fewest_cells)
+        least = max(next((n for most, n in _CELLS.items() if zones <= most), fewest_cells), cells_of_width(sensor))
         if histogram.zone_blur > 0:
             return least
         return next((n for n in range(least, most_refined * least + 1) if _aligned(n, scale)), _REFINED * least)
 
     scale = [s * f for s, f in zip(histogram.zone_scale, sensor.fill_factor, strict=True)]
     return cells(sensor.cols, scale[0]), cells(sensor.rows, scale[1])
+
+
+def cells_of_width(sensor: Sensor) -> int:
+    """Return how many cells a side of a zone it takes for the range of a plane that faces the sensor to vary little."""
+    widest, farthest = 0.105, 0.04  # tangent of a cell, and how far the range varies along it at a metre, at the border
+    zones = zip(sensor.tan_half_angles, (sensor.cols, sensor.rows), strict=True)
+    return math.ceil(max(2 * tan / n * max(1 / widest, tan / math.hypot(1, tan) / farthest) for tan, n in zones))
 
 
 def _aligned(cells: int, scale: float) -> bool:

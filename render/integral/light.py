@@ -245,6 +245,13 @@ def _boxes(c, r, width, height, background, cos_b, sin_b, level, camera, fastest
 
 
 @inner
+def _boxes_of_width(tangent):  # type: ignore[no-untyped-def]
+    """Return into how many boxes of 4 × 4 Gauss points a pixel is cut for the sake of its width."""
+    widest = 0.5  # three points a side would leave 1e-5 of the light
+    return max(math.ceil(tangent / widest), 1)
+
+
+@inner
 def _add_boxes(index, c, r, n_u, n_v, background, cos_b, sin_b, level, camera, light, sums):  # type: ignore[no-untyped-def]
     """Integrate the background over one pixel, cut into boxes."""
     for i in range(4 * n_v):
@@ -271,9 +278,11 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
     """Integrate the background over the skipped pixels of views `start` to `stop`.
 
     A wall takes 3 × 3 Gauss points a pixel. A floor, whose range changes fast towards the horizon, takes 4 × 4. Where
-    the highest of several modulation frequencies turns fast along a pixel, the pixel is cut into boxes of 4 × 4.
+    the highest of several modulation frequencies turns fast along a pixel, or pixels are wide, the pixel is cut into
+    boxes of 4 × 4.
     """
     rows, cols = camera.stop_row - camera.first_row, camera.cols
+    least_u, least_v = _boxes_of_width(camera.fill_u * camera.slope_u), _boxes_of_width(camera.fill_v * camera.slope_v)
     rule, bent_lens = camera.distortion.rule, camera.distortion.model != 0
     for view in range(start, stop):
         cos_b, sin_b = math.cos(poses.bearing[view]), math.sin(poses.bearing[view])
@@ -291,6 +300,7 @@ def add_background(start, stop, poses, camera, light, sums):  # type: ignore[no-
                     row, fastest = r + camera.first_row, light.fastest
                     n_v = _boxes(c, row, 0.0, camera.fill_v, background, cos_b, sin_b, level, camera, fastest)
                     n_u = _boxes(c, row, camera.fill_u, 0.0, background, cos_b, sin_b, level, camera, fastest)
+                    n_u, n_v = max(n_u, least_u), max(n_v, least_v)
                     if n_u * n_v > 1:
                         _add_boxes(index, c, row, n_u, n_v, background, cos_b, sin_b, level, camera, light, sums)
                         continue

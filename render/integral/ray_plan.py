@@ -25,6 +25,10 @@ UNTRUSTED = 2
 _TURN_RAD = 0.15
 """Turn of the fastest phase over a pixel's width at the landmark above which every pixel is cut into 2 × 2 boxes: a
 face seen at a slant is about as deep as the pixel is wide. Half of it is enough at edges and beside limbs."""
+_TURN_OF_BOX_RAD = 1.0
+"""Turn that the points of a box integrate: a pixel over which the phase turns farther is cut into more boxes."""
+_BOXES_A_SIDE = 64
+"""Boxes of an image along a side that a turn of the phase may cost: those of few pixels see surfaces in depth."""
 _SMALL = 2.0
 """Pixels; behind a lens with distortion, pixels are cut into 2 × 2 boxes where all limbs together extend over less."""
 SHORT_LINKS = -1
@@ -90,6 +94,9 @@ def plan_rays(  # type: ignore[no-untyped-def]
             bent_high_u - bent_low_u < _SMALL * camera.slope_u and bent_high_v - bent_low_v < _SMALL * camera.slope_v
         )
         least_parts = max(splits, 2) if small or turn > _TURN_RAD else splits
+        if turn > 2.0 * _TURN_OF_BOX_RAD:
+            most_parts = _BOXES_A_SIDE // max(camera.rows, cols)
+            least_parts = max(least_parts, min(math.ceil(turn / _TURN_OF_BOX_RAD), most_parts))
         start, first_border = n, n_borders
         for row in range(rows):
             r = camera.first_row + row

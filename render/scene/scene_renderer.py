@@ -13,7 +13,7 @@ from phasemark.render.background import Background, Bounces, parameters_of_views
 from phasemark.render.bounces.bounced_light import check_bounces, refined
 from phasemark.render.bounces.patches import light_bounces
 from phasemark.render.direct.bin_counts import detected_counts
-from phasemark.render.direct.footprints import footprint_grid, histogram_of, zones_tile
+from phasemark.render.direct.footprints import cells_of_width, footprint_grid, histogram_of, zones_tile
 from phasemark.render.direct.histogram_images import HistogramImages
 from phasemark.render.direct.sample_counts import signal_and_shares
 from phasemark.render.integral.area_integral import AreaIntegral, camera_poses, images_of_sums, no_light, of_poses
@@ -279,7 +279,8 @@ class SceneRenderer:
         cameras = rigid_transforms(camera2world, "camera2world")
         n, b = self._counts(cameras)
         sensor, histogram = self.sensor, histogram_of(self.sensor)
-        few = 2  # cells a side of a zone: pieces of faces in them resolve ranges, so that 3e-4 of a peak needs no more
+        # cells a side of a zone: pieces of faces in them resolve ranges, so that 3e-4 of a peak needs no more
+        few = max(2, cells_of_width(sensor))
         grid = footprint_grid(sensor, cells=1 if self._rays else few if zones_tile(sensor) else None)
         finest_m, farthest_m = 0.5 * histogram.bin_width_m, histogram.start_m + 1.1 * histogram.length_m
         zones = sensor.rows * sensor.cols
