@@ -32,7 +32,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, SearchPolicy, cramer_rao, kalman_filter
 from phasemark.matcher.direct_method import Measured
 from phasemark.matcher.estimate.acceptance import Rules
-from phasemark.matcher.histograms.cost_shape import lessened, points_about
+from phasemark.matcher.histograms.cost_shape import axes_of_parameters, lessened, points_along, principal_axes
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.histograms.target_matcher import TargetMatcher, _Fit
@@ -108,8 +108,9 @@ def test_gradient_and_information_are_those_of_the_piled_up_likelihood() -> None
         return float((counts * np.log(level) - level).sum())
 
     level, whole, gradient = np.empty((zones, bins)), np.empty((2, 2)), np.empty(2)
-    own = np.empty((zones, 4))
-    frame_sums(counts, signal, slope, 1.0, ambient, extra, cycles, level, whole, gradient, own, np.empty((2, 3)))
+    own, rates, scratch = np.empty((zones, 4)), np.empty((zones, bins, 3)), np.empty((2, 3))
+    seen = counts, signal, slope, 1.0, ambient, extra, cycles
+    frame_sums(*seen, np.empty((0, 0)), level, whole, gradient, own, rates, scratch)
     np.testing.assert_allclose(level, level_at(0, 0, ambient), rtol=1e-9)
     h = 1e-5 * np.eye(4)
     want = np.array([(log_likelihood(h[k]) - log_likelihood(-h[k])) / 2e-5 for k in range(4)])
@@ -117,10 +118,43 @@ def test_gradient_and_information_are_those_of_the_piled_up_likelihood() -> None
         (level_at(h[k, 0], h[k, 1], ambient + h[k, 2:]) - level_at(-h[k, 0], -h[k, 1], ambient - h[k, 2:])) / 2e-5
         for k in range(4)
     ]
-    full = np.array([[(a * b / level).sum() for a in by] for b in by])
-    cross, inner = full[:2, 2:], np.linalg.inv(full[2:, 2:])
-    np.testing.assert_allclose(whole, full[:2, :2] - cross @ inner @ cross.T, rtol=1e-6)
-    np.testing.assert_allclose(gradient, want[:2] - cross @ inner @ want[2:], rtol=1e-5)
+
+    def information_of(count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        full = np.array([[(a * b / count).sum() for a in by] for b in by])
+        tied = full[:2, 2:] @ np.linalg.inv(full[2:, 2:])
+        return full[:2, :2] - tied @ full[2:, :2], tied
+
+    information, tied = information_of(level)
+    np.testing.assert_allclose(whole, information, rtol=1e-6)
+    np.testing.assert_allclose(gradient, want[:2] - tied @ want[2:], rtol=1e-5)
+    np.testing.assert_allclose(rates[..., 0], by[0], rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(rates[..., 2], by[2] + by[3], rtol=1e-6, atol=1e-6)  # light of one zone changes its own
+    least = np.full((zones, bins), float(np.median(level)))
+    frame_sums(*seen, least, level, whole, gradient, own, np.empty((0, 0, 0)), scratch)
+    np.testing.assert_allclose(whole, information_of(np.maximum(level, least))[0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("seed", "pile_up"), [(0, True), (5, False)])
+def test_covariances_hold_where_an_edge_just_enters_a_zone_that_counts_next_to_nothing(seed, pile_up) -> None:
+    """A bin that expects a thousandth of a count once told δ to a hundredth of its error."""
+    table = {**preset(SENSOR).histogram.model_dump(), "photons": 4.0, "cycles": 2000.0, "pile_up": pile_up}
+    plan = BankPlan(
+        sensor=SENSOR, sensor_overrides={"histogram": table}, classes=("cone", "sphere"), distance_m="0.9:1.2:0.1",
+        delta_deg="0:170:10", layout="full",
+    )  # fmt: skip
+    rng, squares = np.random.default_rng(seed), []
+    with build_bank(plan) as bank:
+        matcher = Matcher(bank, "refine", on="histograms", free=FREE, workers=1)
+        renderer = HistogramRenderer(build_mesh(catalog()["cone"]), bank.camera)
+        for _ in range(40):
+            views = Views.broadcast(rng.uniform(0.95, 1.15), rng.uniform(0, np.pi))
+            frame = capture(renderer.render_views(views), bank.camera, rng=rng, n_frames=1)
+            found = matcher.match(frame)
+            if found[0].accepted:
+                squares.append(nees(view_errors(found, views, FREE, np.pi), found.covariance)[0])
+    assert len(squares) >= 30
+    assert max(squares) < chi2.ppf(1 - 1e-5, 2)  # the largest of forty: a false alarm once in 2 500
+    assert np.sum(squares) < chi2.ppf(1 - 1e-4, 2 * len(squares))
 
 
 def test_error_is_at_the_poisson_bound_and_the_covariance_is_honest() -> None:
@@ -294,15 +328,22 @@ def test_a_class_weighs_as_the_volume_of_its_posterior() -> None:
 def test_information_is_that_of_the_slowest_rise_of_the_cost() -> None:
     information, columns = np.array([[4e6, 1e4], [1e4, 900.0]]), [0, 1]
     view = np.array([1.1, 0.4, 0.0, 0.0, 0.0, 0.0])
-    points, axes = points_about(view, columns, information)
+    axes = principal_axes(information)
+    points = points_along(view, columns, axes)
     off = (points - view)[..., columns]
     rise = np.einsum("pki,ij,pkj->pk", off, information, off)
     np.testing.assert_allclose(lessened(information, axes, rise), information, rtol=1e-9)  # a parabola
     rise[1, 5] /= 4  # one side of one axis rises by a quarter of it, and this axis is as far as twice its length
     got = np.linalg.inv(lessened(information, axes, rise))
     np.testing.assert_allclose(got, np.linalg.inv(information) + 3 * np.outer(axes[1], axes[1]), rtol=1e-9)
+    twice = np.concatenate([axes, axes[1:]]), np.concatenate([rise, rise[1:]])
+    np.testing.assert_allclose(np.linalg.inv(lessened(information, *twice)), got, rtol=1e-9)  # an axis counts once
     rise[1, 5], rise[0] = np.nan, 4 * rise[0]  # outside of the limits; and no axis becomes better known
     np.testing.assert_allclose(lessened(information, axes, rise), information, rtol=1e-9)
+    covariance = np.linalg.inv(information)
+    along = axes_of_parameters(information)
+    np.testing.assert_allclose(along, covariance / np.sqrt(np.diag(covariance))[:, None], rtol=1e-9)
+    np.testing.assert_allclose(np.einsum("ai,ij,aj->a", along, information, along), 1.0, rtol=1e-9)
 
 
 def targets_over_covariance(n: int, seed: int) -> np.ndarray:

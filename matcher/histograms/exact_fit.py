@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.estimate.solver import descend
-from phasemark.matcher.histograms.poisson_fit import ambient_step, sums_of_frame
+from phasemark.matcher.histograms.poisson_fit import FrameSums, ambient_step, sums_of_frame
 from phasemark.matcher.histograms.scene_prediction import shifted
 from phasemark.matcher.histograms.table_search import BRIGHTEST, DIMMEST
 from phasemark.render.view import VIEW_FIELDS
@@ -134,6 +134,8 @@ class Fit(NamedTuple):
         Brightness, ambient light and nuisances eliminated, what was known before included.
     settled : bool
         Whether another scene would change nothing: not of a fit that ran out of scenes.
+    straight : bool
+        Whether all counts stay above zero as far as the information leaves them open.
     """
 
     state: NDArray[np.float64]
@@ -144,6 +146,7 @@ class Fit(NamedTuple):
     level: NDArray[np.float64]
     information: NDArray[np.float64]
     settled: bool = False
+    straight: bool = True
 
     @property
     def view(self) -> NDArray[np.float64]:
@@ -200,7 +203,7 @@ def fit_view(
         state, bright, ambient = search.moved(state, step), there.bright, there.ambient
         settled = (np.abs(step[n_free:]) <= _SETTLED * search.longest[n_free:]).all()
         if settled and float(step[:n_free] @ there.view_information @ step[:n_free]) < near_enough**2:
-            return there.fit(state, there.view_information)._replace(settled=True)
+            return there.straightened(state)._replace(settled=True)
         near = (np.abs(state[: len(VIEW_FIELDS)] - other) < _SAME for other in known)
         if (n >= _SCENES_OF_HOPE and there.cost > hopeless) or any(one.all() for one in near):
             return None
@@ -231,15 +234,22 @@ class _LinearScene:
     ) -> None:  # fmt: skip
         self._search, self._frame, self._whole, self._theta = search, frame, whole, theta
         self.offset, self.ambient, self.bright = offset, ambient, min(max(bright, DIMMEST), BRIGHTEST)
-        signal = whole[0]
+        self._signal = whole[0]
         if offset.any():
-            signal = np.maximum(signal + np.tensordot(offset, whole[1:], axes=1), 0.0)
-        self._sums = sums_of_frame(frame.counts, signal, whole[1:], self.bright, ambient, frame.extra, frame.cycles)
+            self._signal = np.maximum(self._signal + np.tensordot(offset, whole[1:], axes=1), 0.0)
+        self._sums = self._summed()
         at, weight = theta + offset, search.weight
         self.cost = self._sums.deviance + float(weight @ at**2)
         self.information, self.gradient = self._sums.information, self._sums.gradient
         self.gradient[:-1] -= weight * at
         self.information[np.diag_indices(len(at))] += weight
+
+    def _summed(self, **options: NDArray[np.float64]) -> FrameSums:
+        """Return the likelihood of the frame here."""
+        frame, slopes = self._frame, self._whole[1:]
+        return sums_of_frame(
+            frame.counts, self._signal, slopes, self.bright, self.ambient, frame.extra, frame.cycles, **options
+        )
 
     def moved(self, step: NDArray[np.float64]) -> _LinearScene:
         """Return the scene a step away."""
@@ -255,10 +265,35 @@ class _LinearScene:
         farthest = float((np.abs(self.offset + step[:-1]) / self._search.longest).max(initial=0.0))
         return max(farthest, abs(float(step[-1])) / _LONGEST_LOG_BRIGHT)
 
+    def straightened(self, state: NDArray[np.float64]) -> Fit:
+        """Return the scene as a fit, with the information of counts that are straight over what it leaves open.
+
+        Where an edge just enters a zone a bin is expected to count next to nothing, and the information per count has
+        no limit. It holds only as far as the count stays above zero: every bin is taken for what it counts a standard
+        deviation away, at least.
+        """
+        rounds, well_above = 6, 3.0  # standard deviations that a count which is straight stays above zero
+        own, information, straight = self._sums.own, self.information, True
+        rates = np.empty((*self._signal.shape, len(information) + 1))
+        self._summed(rates=rates)
+        rates = rates[..., :-1] - rates[..., -1:] * (own[:, :-2] / own[:, -2:-1])[:, None]
+        for _ in range(rounds):
+            covariance = np.linalg.pinv(information, hermitian=True)
+            least = np.sqrt(np.maximum(np.einsum("zja,ab,zjb->zj", rates, covariance, rates), 0.0))
+            straight &= bool((well_above * least <= self._sums.level).all())
+            if (least <= self._sums.level).all():
+                break
+            information = self._summed(least=least).information
+            information[np.diag_indices(len(self._search.weight))] += self._search.weight
+        return self.fit(state, self._of_view(information))._replace(straight=straight)
+
     @property
     def view_information(self) -> NDArray[np.float64]:
         """Information in the view alone, brightness and nuisances eliminated."""
-        whole = self.information
+        return self._of_view(self.information)
+
+    def _of_view(self, whole: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what information in all that is varied leaves for the view."""
         no_information = 1e-300
         while len(whole) > len(self._search.free):
             own = max(float(whole[-1, -1]), no_information)

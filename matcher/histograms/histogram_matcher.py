@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from phasemark.matcher.estimate.acceptance import no_answer
+from phasemark.matcher.histograms.cost_shape import axes_of_parameters, lessened, points_along, principal_axes
 from phasemark.matcher.histograms.direct_matcher import glass_counts
 from phasemark.matcher.histograms.exact_fit import Counted, Fit, Search, Start, fit_view
 from phasemark.matcher.histograms.histogram_search import SCENES, SURE_COST, HistogramSearch
@@ -60,6 +61,7 @@ class HistogramMatcher(HistogramSearch):
             start = left.pop(0)
             if _follow(fits, self.searches[start.class_index], frame, start):
                 error = max(error, abs(fits[-1][1].cost - start.cost))
+        fits = self._with_slow_rise(fits, self.searches, frame)
         others = [Explanation(one.class_index, one.view, one.cost - error, None) for one in left]
         test, estimated = self._tested(fits)
         return self._answer(fits, others, test, bare, estimated, self.background_of(_best(fits)[1].state))
@@ -106,11 +108,36 @@ class HistogramMatcher(HistogramSearch):
         for c, search in enumerate(searches):
             for start in [start for start in first if start.class_index == c][:of_class]:
                 _follow(fits, search, joint, start)
+        fits = self._with_slow_rise(fits, searches, joint)
         best_class, best = _best(fits)
         estimated = _estimated(searches[best_class], best)
         apart = self._best_apart(counted, models[best_class], first2camera, best)
         test = _joint_test(best, joint, estimated, apart, len(_OWN) * len(counted) - len(self.free))
         return self._answer(fits, (), test, sum(bare), estimated, None)
+
+    def _with_slow_rise(self, fits: Found, searches: Sequence[Search], frame: Counted) -> Found:
+        """Return fits, the best one with the information that the cost about it shows where counts vanish there."""
+        best_class, best = _best(fits)
+        if best.straight:
+            return fits
+        search, information = searches[best_class], best.information
+        columns = [VIEW_FIELDS.index(name) for name in self.free]
+        fixed = Search(search.model, (), np.empty(0), search.limits[:, : len(VIEW_FIELDS)])
+        weight = search.weight[: len(columns)]
+        rounds = 3  # each lessens the information along an axis to a fiftieth at most
+        for _ in range(rounds):
+            axes = np.concatenate([axes_of_parameters(information), principal_axes(information)])
+            points = points_along(best.view, columns, axes)
+            inside = (points == np.clip(points, *self.limits)).all(axis=-1)
+            rise = np.full(inside.shape, np.nan)
+            for k in zip(*np.nonzero(inside), strict=True):
+                state = np.concatenate([points[k], best.state[len(VIEW_FIELDS) :]])
+                there = fit_view(fixed, frame, Start(best_class, state, best.cost, best.bright, best.ambient), SCENES)
+                rise[k] = there.cost + weight @ points[k][columns] ** 2 - best.cost if there is not None else np.nan
+            before, information = information, lessened(information, axes, rise)
+            if np.allclose(information, before, rtol=0.5):
+                break
+        return [(c, fit._replace(information=information) if fit is best else fit) for c, fit in fits]
 
     def _answer(
         self, fits: Found, others: Sequence[Explanation], test: FitTest, bare: float, estimated: int,

@@ -21,6 +21,7 @@ from phasemark.render.kernel import inner, kernel
 LEAST_COUNT = 1e-3
 """No bin is expected to count less: what a model gets wrong must not become infinitely improbable."""
 _LOWEST, _HIGHEST, _PER_DECADE = -3.0, 4.0, 40
+_NO_BINS, _NO_RATES = np.empty((0, 0)), np.empty((0, 0, 0))
 
 
 @lru_cache(maxsize=1)
@@ -84,7 +85,7 @@ def log_term(n, mean):  # type: ignore[no-untyped-def]
 
 @kernel
 def frame_sums(  # type: ignore[no-untyped-def]
-    counts, signal, slope, bright, ambient, extra, cycles, level, information, gradient, own, scratch,
+    counts, signal, slope, bright, ambient, extra, cycles, least, level, information, gradient, own, rates, scratch,
 ):  # fmt: skip
     """Fill the information and the gradient of one frame; returns its deviance.
 
@@ -101,6 +102,8 @@ def frame_sums(  # type: ignore[no-untyped-def]
         Counts of the cover glass.
     cycles : float
         Infinite without pile-up.
+    least : (zones, bins)
+        What the information takes the expected counts for at least; empty: they count as they are.
     level : (zones, bins)
         Filled with the expected counts.
     information : (p + 1, p + 1)
@@ -108,6 +111,8 @@ def frame_sums(  # type: ignore[no-untyped-def]
     gradient : (p + 1,)
     own : (zones, p + 3)
         Filled with each zone's information across α and the parameters, that of α alone, and its gradient.
+    rates : (zones, bins, p + 2)
+        Filled with the slopes of the expected counts by the parameters, ln β and α; empty: they are not asked for.
     scratch : (2, p + 2)
     """
     p = slope.shape[0]
@@ -141,6 +146,10 @@ def frame_sums(  # type: ignore[no-untyped-def]
                 scratch[1, a] += d
             through = after
             excess = n / count - 1.0
+            for a in range(rates.shape[2]):
+                rates[z, j, a] = scratch[0, a]
+            if len(least) > 0:
+                count = max(count, least[z, j])
             for a in range(q):
                 weighted = scratch[0, a] / count
                 for b in range(a + 1):
@@ -184,12 +193,14 @@ class FrameSums(NamedTuple):
 def sums_of_frame(
     counts: NDArray[np.float64], signal: NDArray[np.float64], slope: NDArray[np.float64], bright: float,
     ambient: NDArray[np.float64], extra: NDArray[np.float64], cycles: float,
+    least: NDArray[np.float64] = _NO_BINS, rates: NDArray[np.float64] = _NO_RATES,
 ) -> FrameSums:  # fmt: skip
     """Return the likelihood of one frame with its information and gradient; arguments as for :func:`frame_sums`."""
     q, shape = len(slope) + 1, signal.shape
     level, information, gradient, own = np.empty(shape), np.empty((q, q)), np.empty(q), np.empty((len(signal), q + 2))
+    scratch = np.empty((2, q + 1))
     deviance = frame_sums(
-        counts, signal, slope, bright, ambient, extra, cycles, level, information, gradient, own, np.empty((2, q + 1))
+        counts, signal, slope, bright, ambient, extra, cycles, least, level, information, gradient, own, rates, scratch
     )
     return FrameSums(deviance, level, information, gradient, own)
 

@@ -19,7 +19,7 @@ from scipy import special
 from phasemark import UsageError
 from phasemark.matcher.estimate.acceptance import no_answer
 from phasemark.matcher.estimate.solver import descend
-from phasemark.matcher.histograms.cost_shape import lessened, points_about
+from phasemark.matcher.histograms.cost_shape import lessened, points_along, principal_axes
 from phasemark.matcher.histograms.direct_matcher import DirectMatcher
 from phasemark.matcher.histograms.exact_fit import LONGEST
 from phasemark.matcher.histograms.histogram_table import TableGrid, build_table, plane_light
@@ -310,7 +310,8 @@ class TargetMatcher(DirectMatcher):
     def _lessened(self, frame: Reported, fit: _Fit) -> _Fit:
         """Return the best fit, or a better one beside it, with the information that the cost about it shows."""
         for left in range(_BETTER_FITS, -1, -1):
-            points, axes = points_about(fit.view, self.columns, fit.information)
+            axes = principal_axes(fit.information)
+            points = points_along(fit.view, self.columns, axes)
             inside = (points == np.clip(points, *self.limits)).all(axis=-1)
             costs = np.full(inside.shape, np.nan)
             costs[inside] = self._costs(frame, fit.class_index, points[inside])
