@@ -28,6 +28,8 @@ MAY_RETURN_COVERAGE = 0.005
 """A pixel that sees less of the landmark than this returns nothing, unless a background does."""
 FILLED_COVERAGE = 0.995
 """A pixel that sees this much of the landmark shows nothing of what stands behind it."""
+SURELY, PERHAPS = 0.5, 2.0
+"""Shares of the largest one-frame σ that counts: of light that must return, whatever the noise, and that may."""
 MIN_RETURNS = 3
 """A frame with fewer returns decides nothing: two numbers are sought."""
 _USUAL_LIMIT_RAD = 0.1
@@ -39,13 +41,17 @@ def one_frame_limit_m(sensor: Sensor) -> float:
     return (sensor.max_phase_std_rad or _USUAL_LIMIT_RAD) * sensor.metres_per_radian
 
 
-def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating], sensor: Sensor) -> NDArray[np.bool_]:
+def counts(
+    phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating], sensor: Sensor, share: float = 1.0
+) -> NDArray[np.bool_]:
     """Return which pixels of noise-free images one frame measures to within the limit (PHYSICS section 7).
 
     Parameters
     ----------
     phasor, intensity : (..., rows, cols)
     sensor : Sensor
+    share : float
+        Of the limit, in place of all of it.
 
     Returns
     -------
@@ -60,7 +66,7 @@ def counts(phasor: NDArray[np.complexfloating], intensity: NDArray[np.floating],
         if sensor.max_range_m is not None:
             lit &= np.where(lit, phasor_to_range_m(np.where(lit, phasor, 1.0), sensor), 0.0) <= sensor.max_range_m
     std = predicted_range_std(amplitude, intensity, sensor)
-    return np.asarray(lit & (std <= one_frame_limit_m(sensor) * (1 + _ROUNDING)))
+    return np.asarray(lit & (std <= share * one_frame_limit_m(sensor) * (1 + _ROUNDING)))
 
 
 def pixel_mask(pixels: str | NDArray[np.bool_], sensor: Sensor) -> NDArray[np.bool_]:

@@ -184,11 +184,13 @@ def bank(mesh: trimesh.Trimesh, sensor: Sensor, tmp_path_factory: pytest.TempPat
     return build_bank(plan, folder / "bank.h5")
 
 
-def _matched(bank: Bank, image: PhasorImages, background: Any) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Return which of some frames are accepted, and error of D and its standard deviation, (N, 2) m."""
+def _matched(
+    bank: Bank, image: PhasorImages, background: Any, n: int = N
+) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    """Return which of some frames are accepted, and error of D and its standard deviation, (n, 2) m."""
     matcher = Matcher(bank, "refine", free=("distance_m", "delta_rad"), background=background)
     accepted, errors = [], []
-    for seed in range(N):
+    for seed in range(n):
         frames = capture(image, bank.sensor, n_frames=50, rng=np.random.default_rng(seed))
         answer = matcher.match(kalman_filter(frames))[0]
         accepted.append(answer.accepted)
@@ -206,8 +208,8 @@ def test_foreign_frames_are_matched_where_light_bounces_off_a_floor_of_unknown_a
     assert accepted.all()
     assert abs(errors[:, 0].mean()) < 3e-4
     assert np.median((errors[:, 0] / errors[:, 1]) ** 2) < 3.0
-    direct, _ = _matched(bank, image, BEHIND)
-    assert not direct.any()  # without bounces the frames are refused
+    direct, _ = _matched(bank, image, BEHIND, n=1)
+    assert not direct.any()  # without bounces a frame is refused, whatever its noise
 
 
 def test_a_box_before_a_wall_alone_returns_the_light_of_the_same_scene() -> None:

@@ -175,13 +175,14 @@ def test_a_landmark_that_fits_among_missing_pixels_is_diagnosed_with_what_they_m
 
 
 def test_a_landmark_whose_surface_goes_on_beside_it_is_said_to_fit_and_not_to_end(banks):
-    frames = frames_of("pmd-16x16", *CONE_VIEW)
+    frames = frames_of("vl53l5cx-8x8", *CONE_VIEW)
     for row in range(frames.sensor.rows):
         seen = np.flatnonzero(frames.state[0, row] == PixelState.RETURN)
-        for name in ARRAYS if seen.size else ():
-            values = getattr(frames, name)[0, row]
-            values[: seen[0]], values[seen[-1] + 1 :] = values[seen[0]], values[seen[-1]]
-    matcher = Matcher(banks["pmd-16x16"], "refine", background="unknown")
+        for values in (getattr(frames, name) for name in ARRAYS if seen.size):
+            if values is not None:
+                row_of = values[0, row]
+                row_of[: seen[0]], row_of[seen[-1] + 1 :] = row_of[seen[0]], row_of[seen[-1]]
+    matcher = Matcher(banks["vl53l5cx-8x8"], "refine", background="unknown")
     found = diagnose(matcher, frames, seconds=math.inf)
     assert found.changes == ()
     assert "cone fits, but the pixels beside it do not show where it ends" in str(found)
@@ -243,10 +244,11 @@ def test_the_command_names_the_option_that_makes_a_refused_frame_fit(banks, tmp_
     assert flag in note
     (answer,) = json.loads(done.out)["matches"]
     assert answer["diagnosis"]["changes"][0]["parameter"] == "free"
-    assert main([*arguments, *options, "--json", "--no-diagnosis"]) == 0
-    done = capsys.readouterr()
-    assert done.err == ""
-    assert "diagnosis" not in json.loads(done.out)["matches"][0]
+    if "nearest" in options:  # the same of every method, and this one is fast
+        assert main([*arguments, *options, "--json", "--no-diagnosis"]) == 0
+        done = capsys.readouterr()
+        assert done.err == ""
+        assert "diagnosis" not in json.loads(done.out)["matches"][0]
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,6 @@
 """The same bytes from clusters, even if workers die; what was begun is continued; and other versions are refused."""
 
 import json
-import subprocess
-import sys
 
 import pytest
 from builders import run_program
@@ -10,7 +8,7 @@ from builders import run_program
 from phasemark import OutputExistsError, UsageError
 from phasemark.data import FramePlan, build_frames
 from phasemark.data.frames.build_frames import FrameJob
-from phasemark.data.shards.remote import make_bytes
+from phasemark.data.shards.remote import make_bytes, open_maker
 
 PLAN = FramePlan(classes=["cone", "post"], views=40, frames_per_view=2, seed=7, wall_m=4.0)
 
@@ -51,18 +49,11 @@ def test_a_worker_that_would_make_other_bytes_is_refused():
         make_bytes(json.dumps([job.maker, job.spec()]), json.dumps(job.identity()), 0, 1)
 
 
-def test_a_scheduler_that_does_not_answer_is_named():
+def test_a_scheduler_that_does_not_answer_is_named(monkeypatch):
     pytest.importorskip("distributed")
-    program = (
-        "from phasemark.data.shards.remote import open_maker\n"
-        "from phasemark.data.frames.build_frames import FrameJob\n"
-        "from phasemark.data import FramePlan\n"
-        "import phasemark.data.shards.remote as remote\n"
-        "remote.CONNECT_SECONDS = 1\n"
-        "open_maker('tcp://127.0.0.1:9', FrameJob(FramePlan(classes=['cone'], views=1)))\n"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
-    assert "UsageError: no Dask scheduler answers at tcp://127.0.0.1:9" in done.stderr.splitlines()[-1]
+    monkeypatch.setattr("phasemark.data.shards.remote.CONNECT_SECONDS", 0.2)
+    with pytest.raises(UsageError, match=r"^no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+        open_maker("tcp://127.0.0.1:9", FrameJob(FramePlan(classes=["cone"], views=1)))
 
 
 @pytest.mark.parametrize(("views", "n"), [(40, 1), pytest.param(1500, 200, marks=pytest.mark.soak)])

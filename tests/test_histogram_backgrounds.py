@@ -66,19 +66,19 @@ def test_pile_up_and_zones_that_overlap_leave_the_bound_as_it_is() -> None:
 
 def test_a_wall_that_is_not_stated_or_stands_elsewhere_is_refused() -> None:
     rng = np.random.default_rng(7)
-    for off in (0.02, 0.05, 0.1, -0.02, -0.05):
+    for off in (0.02, -0.02, 0.1):
         moved = Background(wall_m=1.6 + off)
         views = random_views(2, rng)
         found = matcher_of(WALL).match(frames_of("cone", views, rng, behind=moved))
         assert set(found.reason) == {"poor fit"}, off
-    found = matcher_of(None).match(frames_of("cone", random_views(4, rng), rng, behind=WALL))
+    found = matcher_of(None).match(frames_of("cone", random_views(2, rng), rng, behind=WALL))
     assert not found.accepted.any()
 
 
 @pytest.mark.parametrize("stated", [WALL, "auto"])
 def test_a_bare_wall_is_no_landmark(stated: Stated) -> None:
     rng = np.random.default_rng(8)
-    found = matcher_of(stated).match(frames_of(None, random_views(2, rng), rng, behind=WALL))
+    found = matcher_of(stated).match(frames_of(None, random_views(1, rng), rng, behind=WALL))
     assert all(name is None for name in found.class_name)
     assert (found.class_probability["none"] > 0.9).all()
 

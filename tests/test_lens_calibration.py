@@ -216,7 +216,7 @@ def test_a_step_to_a_fold_goes_as_far_as_there_is_none_and_slopes_are_taken_besi
 def test_a_descent_next_to_a_fold_comes_back_to_the_true_lens():
     rng = np.random.default_rng(9)
     near = WIDE.with_(lens=BARREL.with_terms(k1=-0.34))  # it folds a hundredth farther
-    poses = covering(rng, 4)
+    poses = covering(rng, 3)
     frames = replace(filtered(take(Mounting.of_sensor(WIDE, 0.8), poses, rng, sensor=WIDE)), sensor=near)
     found = calibrate(MESH, frames, poses, free=("fx", "k1"))
     assert nees(found, Mounting.of_sensor(WIDE, 0.8)) < stats.chi2.ppf(0.999, 2)

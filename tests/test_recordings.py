@@ -27,11 +27,13 @@ SCENE = ["--class", "cylinder", "--sensor", "vl53l5cx-8x8", "--distance", 0.75, 
 READ = ["--quantity", "z", "--valid-status", 5]
 N = 9
 """Frames of the flight."""
+N_BEGIN = 3
+"""Frames of its begin."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Return a folder with a bank of the cylinder, a flight towards it, and a recording at rest."""
+    """Return a folder with a bank of the cylinder, a flight towards it and its begin, and a recording at rest."""
     folder = tmp_path_factory.mktemp("recordings")
 
     def made(*arguments):
@@ -41,6 +43,9 @@ def folder(tmp_path_factory):
     made("bank", "build", "--class", "cylinder", "--sensor", "vl53l5cx-8x8", *grid, "-o", folder / "bank.h5")
     made("frames", "simulate", *SCENE, "--moving", "--frames", N, "--to-distance", 0.6, "-o", folder / "flight.csv")
     made("frames", "simulate", *SCENE, "--frames", 20, "-o", folder / "still.csv")
+    note_and_header = 2
+    lines = (folder / "flight.csv").read_text().splitlines(keepends=True)[: note_and_header + N_BEGIN]
+    (folder / "begin.csv").write_text("".join(lines))
     return folder
 
 
@@ -61,7 +66,7 @@ def rows_of(path):
     return list(csv.DictReader(io.StringIO(path.read_text())))
 
 
-def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder, tmp_path):
+def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder):
     match, options = ["match", folder / "bank.h5"], [*READ, "--moving", "--no-diagnosis"]
     code, out, err = run(*match, folder / "flight.csv", *options, "--json")
     assert code == 0
@@ -76,10 +81,8 @@ def test_every_frame_of_a_moving_camera_is_a_match_with_its_time(run, folder, tm
     truth = np.linspace(0.75, 0.6, N)
     # five standard deviations of 0.4 mm
     np.testing.assert_allclose(np.array([one["distance_m"] for one in matches])[accepted], truth[accepted], atol=0.002)
-    n, note_and_header = 3, 2  # lines of the table take few frames
-    flight = (folder / "flight.csv").read_text().splitlines(keepends=True)[: note_and_header + n]
-    (tmp_path / "begin.csv").write_text("".join(flight))
-    code, out, _ = run(*match, tmp_path / "begin.csv", *options)
+    n = N_BEGIN  # lines of the table take few frames
+    code, out, _ = run(*match, folder / "begin.csv", *options)
     header, *rows = out.splitlines()
     titles = ["frame", "time (s)", "class", "D (m)", "δ (°)", "bearing (°)", "pitch (°)", "roll (°)", "background"]
     titles += ["accepted", "p"]
@@ -139,14 +142,14 @@ def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):
 
 def test_answers_do_not_depend_on_the_size_of_a_batch_and_single_frames_have_the_noise_that_the_sensor_states(folder):
     with open_bank(folder / "bank.h5") as bank:
-        frames = read_frames(folder / "flight.csv", sensor=bank.sensor, quantity="z", valid_status=[5])
+        frames = read_frames(folder / "begin.csv", sensor=bank.sensor, quantity="z", valid_status=[5])
         matcher = Matcher(bank, "refine", background=Background(wall_m=1.5))
         batches = [
             list(match_in_batches(matcher, frames.each_a_position(), kalman_filter, at_once=at_once))
             for at_once in (2, 256)
         ]
     found = [[match.as_dict() for batch in one for match in batch.matches] for one in batches]
-    assert len(found[0]) == N
+    assert len(found[0]) == N_BEGIN
     assert found[0] == found[1]
     filtered = batches[1][0].filtered
     assert isinstance(filtered, FilteredFrames)
@@ -187,7 +190,7 @@ def test_the_fit_of_frames_at_rest_passes_its_test_as_often_as_stated(run, folde
 
 def test_estimates_are_a_table_of_what_was_free(run, folder, tmp_path):
     file = tmp_path / "estimates.csv"
-    match = ["match", folder / "bank.h5", folder / "flight.csv", *READ, *WALL, "--moving", "--method", "refine"]
+    match = ["match", folder / "bank.h5", folder / "begin.csv", *READ, *WALL, "--moving", "--method", "refine"]
     code, answers, _ = run(*match, "--free", "bearing", "--estimates", file, "--json")
     assert code == 0
     rows = rows_of(file)

@@ -180,8 +180,9 @@ def test_the_numbers_of_a_map_are_those_of_its_cells_and_maps_of_ratios_share_on
 
 def test_a_report_regenerates_bit_for_bit(folder, tmp_path, monkeypatch):
     again = shutil.copytree(folder, tmp_path / "again")
-    # each figure takes a second to write: every third, and the page without the others
-    monkeypatch.setattr("phasemark.matcher.sweep.report.sweep_figures", lambda *of: list(sweep_figures(*of))[::3])
+    # figures and examples take a second each: every sixth figure, one example, and the page without the others
+    monkeypatch.setattr("phasemark.matcher.sweep.report.sweep_figures", lambda *of: list(sweep_figures(*of))[::6])
+    monkeypatch.setattr("phasemark.matcher.sweep.report._MOST_EXAMPLES", 1)
     write_report(again)
     for file in sorted((folder / "figures").iterdir()):
         assert (again / "figures" / file.name).read_bytes() == file.read_bytes(), file.name

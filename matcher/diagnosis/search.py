@@ -27,7 +27,7 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.setup import ROBUST_FROM
 from phasemark.matcher.nearest.bank_minima import Starts
-from phasemark.matcher.pixel_agreement import counts
+from phasemark.matcher.pixel_agreement import PERHAPS, counts
 from phasemark.render import Background, Renderer, Sensor
 from phasemark.render.view import delta_period_rad, wrap_delta_rad
 
@@ -147,7 +147,7 @@ class Search:
         sensor, returns = wider(self._sensor, size), None
         if background is not None:
             behind = Renderer(None, sensor).render(1.0, background=background)
-            returns = counts(behind.phasor, behind.intensity, sensor).reshape(1, -1)
+            returns = counts(behind.phasor, behind.intensity, sensor, PERHAPS).reshape(1, -1)
         used = np.ones(sensor.rows * sensor.cols, np.bool_)
         settings = DescentSettings(free, used, ROBUST_FROM, returns_behind=returns)
         return self._model.seen_by(sensor).with_background(background), settings

@@ -38,7 +38,7 @@ from phasemark.matcher.likelihood.valleys import with_valleys
 from phasemark.matcher.match import Match
 from phasemark.matcher.nearest.bank_minima import Search, Starts
 from phasemark.matcher.nearest.templates import Observation
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MIN_RETURNS, SURELY, counts
 from phasemark.render import Background, PhasorImages
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.threads import mapped
@@ -252,7 +252,7 @@ def bare_cost(seen: Observation, behind: PhasorImages | None) -> NDArray[np.floa
     sensor, shape = behind.sensor, (len(behind.phasor), -1)
     model = behind.range_m.reshape(shape)
     lit = np.isfinite(model)
-    sure = counts(behind.phasor, behind.intensity, sensor).reshape(shape)
+    sure = counts(behind.phasor, behind.intensity, sensor, SURELY).reshape(shape)
     residual = wrap_difference_m(np.where(lit & seen.returned, seen.range_m - np.where(lit, model, 0.0), 0.0), sensor)
     wrong = (seen.returned & ~lit) | (seen.not_returned & sure)
     squared = np.minimum(seen.weight * residual**2, DISAGREEMENT)

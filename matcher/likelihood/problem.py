@@ -244,8 +244,8 @@ class Problem:
         square = (self.prior_weight * rate**2)[:, :, None] * np.eye(p)
         return replace(sums, gradient=gradient, information=sums.information + square)
 
-    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels count at some views, (m, pixels)."""
+    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64], share: float = 1.0) -> NDArray[np.bool_]:
+        """Return which pixels count at some views, (m, pixels), or would with a share of the σ that they may have."""
         trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
         phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
@@ -257,7 +257,7 @@ class Problem:
                     images.phasor, images.intensity, sensor
                 )
                 trusted = trusted & ~cancels
-        return counts(phasor, images.intensity, sensor) & trusted
+        return counts(phasor, images.intensity, sensor, share) & trusted
 
     def best_of_frames(self, state: State) -> NDArray[np.intp]:
         """Return the best candidate of each frame, in the order of the candidates, if its cost is within its limit."""

@@ -21,7 +21,7 @@ from phasemark.matcher.likelihood.strip_images import StripModel
 from phasemark.matcher.nearest.bank_minima import Search, Upward
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD, CellBounds, Turned
 from phasemark.matcher.nearest.grid import CELL_M, CELL_RAD, first_step
-from phasemark.matcher.pixel_agreement import counts
+from phasemark.matcher.pixel_agreement import PERHAPS, counts
 from phasemark.render import Background, PhasorImages, Renderer, Views
 
 __all__ = ["Scene", "Scenes"]
@@ -72,7 +72,7 @@ class Scene:
         if (behind := self.behind) is not None:
             shape = len(behind.phasor), -1
             phasor = behind.phasor.reshape(shape)
-            returns = counts(behind.phasor, behind.intensity, behind.sensor).reshape(shape)
+            returns = counts(behind.phasor, behind.intensity, behind.sensor, PERHAPS).reshape(shape)
         return DescentSettings(
             setup.free,
             setup.used,

@@ -1,7 +1,7 @@
 """Covariances along the valleys of the likelihood, where those of slopes about a solution do not hold.
 
-Where an edge reaches a border of wide pixels, slopes jump. Those about a solution may claim an angle that the cost some
-standard deviations away does not confirm: the valley is flat to one side, or bends.
+Where an edge reaches a border of pixels before a background, or of wide pixels, slopes jump. Those about a solution may
+claim an angle that the cost some standard deviations away does not confirm: the valley is flat to one side, or bends.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ rise that is expected there it does not."""
 def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     """Return fits with covariances as wide as the likelihood is; only the best of each frame, if it would be accepted.
 
-    Each parameter is moved by four standard deviations to both sides, alone and with the others. Where the cost rises
-    by less than half of what is expected, the part of that parameter is the second moment of its profile likelihood,
-    along the valley. Nothing is done where slopes hold, as those by distance, δ and bearing do where pixels are narrow,
-    nor with a robust loss, which is flat far away by design.
+    Each parameter is moved by four standard deviations to both sides, alone and, where pixels are wide or height, pitch
+    or roll is free, with the others. Where the cost rises by less than half of what is expected, the part of that
+    parameter is the second moment of its profile likelihood, along the valley. Nothing is done where slopes hold: where
+    pixels are narrow, the camera is level and nothing is behind; nor with a robust loss, flat far away by design.
     """
     setup = scene.setup
-    slopes_hold = setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD and setup.height_and_tilt_are_known
-    if setup.huber is not None or slopes_hold:
+    simple = setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD and setup.height_and_tilt_are_known
+    if setup.huber is not None or (simple and scene.behind is None):
         return fits
     best = best_of_frame(fits)
     best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]]
@@ -46,7 +46,7 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     own = fits[best]
     problem = Problem(scene.final, evidence, own.frame, own.class_index, scene.settings())
     theta = np.column_stack([own.view, own.albedo])
-    wide = _along_valleys(problem, problem.at(theta, with_slopes=problem.with_albedo), own.covariance)
+    wide = _along_valleys(problem, problem.at(theta, with_slopes=problem.with_albedo), own.covariance, not simple)
     covariance, std, information = fits.covariance.copy(), fits.std_without_one.copy(), fits.information.copy()
     covariance[best] = wide
     std[best] *= np.sqrt(np.einsum("mpp->mp", wide) / np.einsum("mpp->mp", own.covariance))
@@ -54,7 +54,9 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     return replace(fits, covariance=covariance, std_without_one=std, information=information)
 
 
-def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+def _along_valleys(
+    problem: Problem, state: State, covariance: NDArray[np.float64], together: bool
+) -> NDArray[np.float64]:
     """Return covariances of solutions that hold along the valleys of their likelihoods, too, (m, p, p)."""
     p, wide = covariance.shape[1], covariance.copy()
     known = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
@@ -64,7 +66,8 @@ def _along_valleys(problem: Problem, state: State, covariance: NDArray[np.float6
     information, spread = covariance_of(covariance[known], 1 / problem.scale[:p]), covariance[known]
     along = spread / np.sqrt(spread[:, each, each])[..., None]
     alone = along * np.eye(p)
-    ways = _ASKED_SIGMA * np.stack([along, alone, -along, -alone], axis=1)  # (k, 4, parameters moved, p)
+    asked = [along, alone, -along, -alone] if together else [alone, -alone]
+    ways = _ASKED_SIGMA * np.stack(asked, axis=1)  # (k, ways, parameters moved, p)
     expected = np.einsum("kwap,kpq,kwaq->kwa", ways, information, ways)
     if problem.with_albedo:  # which follows
         sums = state.sums.information[known]

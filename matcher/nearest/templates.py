@@ -28,7 +28,14 @@ from numba import njit
 from numpy.typing import NDArray
 
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState, assumed_std_m
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, disagrees
+from phasemark.matcher.pixel_agreement import (
+    DISAGREEMENT,
+    MAY_RETURN_COVERAGE,
+    MUST_RETURN_COVERAGE,
+    PERHAPS,
+    SURELY,
+    disagrees,
+)
 from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 
@@ -256,8 +263,8 @@ def seen_by_images(
         s = s + behind.astype(np.complex64)
         noise = predicted_range_std(np.abs(behind), behind_intensity, sensor) / sensor.metres_per_radian
         limit = sensor.max_phase_std_rad or np.inf
-        may |= noise <= limit
-        must |= noise <= 0.5 * limit
+        may |= noise <= PERHAPS * limit
+        must |= noise <= SURELY * limit
     may &= s != 0
     return np.where(may, phasor_to_range_m(s, sensor), 0.0), may, must
 
