@@ -99,7 +99,7 @@ def test_options_of_maximum_likelihood_are_refused_with_the_nearest_image(bank, 
 
 @pytest.mark.parametrize(("wall_m", "exposures"), [(4.0, 20), (5.0, 1), (9.0, 20)])
 def test_covariances_hold_where_an_edge_reaches_a_border_of_pixels_before_a_wall(tmp_path, wall_m, exposures):
-    """Beside the border slopes are others than beyond it: one of a hundred answers was 8 σ off, of single frames two 6 σ.
+    """Beside the border slopes are not those beyond it: one of a hundred answers was 8 σ off, two of single frames 6 σ.
 
     Of the wall at 9 m single exposures are near the largest noise that counts: one frame in twenty was accepted.
     """

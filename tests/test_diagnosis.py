@@ -216,6 +216,16 @@ def test_a_diagnosis_stops_when_time_is_up_and_its_message_tells(banks):
     assert found.as_dict()["stopped"]
 
 
+def test_a_frame_whose_answer_is_known_is_not_matched_again(banks, monkeypatch):
+    matcher = Matcher(banks["vl53l5cx-8x8"], "refine")
+    ranges = np.full((1, 1, 8, 8), 0.6)
+    ranges[..., ::2] = 1.3
+    frames = kalman_filter(Frames(ranges, sensor=matcher.bank.sensor))
+    (answer,) = matcher.match(frames)
+    monkeypatch.setattr(matcher, "match", lambda frames: pytest.fail("it was matched again"))
+    assert diagnose(matcher, frames, seconds=0.0, refused=answer).refused is answer
+
+
 def test_an_accepted_frame_has_nothing_to_diagnose(banks):
     with pytest.raises(UsageError, match="is accepted"):
         diagnosis_of(banks["pmd-16x16"], frames_of("pmd-16x16", *CONE_VIEW))

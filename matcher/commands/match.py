@@ -201,7 +201,7 @@ class _Answers:
     distances_m: list[float] = field(default_factory=list)
     n_mirrored: int = 0
     pose_time_s: Sequence[float] | None = None
-    refused: tuple[int, FilteredFrames] | None = None
+    refused: tuple[int, FilteredFrames, Match] | None = None
     placed: Match | None = None
     table: Table | None = None
     """Its columns are those of the first match."""
@@ -260,7 +260,7 @@ class _Answers:
             if self.placed is None and (match.accepted or match.reason == "poor fit"):
                 self.placed = match
             if self.refused is None and not match.accepted:
-                self.refused = index, batch.filtered[k : k + 1]
+                self.refused = index, batch.filtered[k : k + 1], match
         return answer
 
     def _print(self, answers: Sequence[dict[str, Any]], start: int, columns: Columns) -> None:
@@ -325,9 +325,10 @@ class _Answers:
         some_right = self.moving and self._n_accepted
         if self.refused is None or self.results.no_diagnosis or some_right:
             return
-        index, filtered = self.refused
+        index, filtered, refused = self.refused
         try:
-            diagnosis = replace(diagnose(matcher, filtered, 0, background=search.background), index=index)
+            found = diagnose(matcher, filtered, 0, background=search.background, refused=refused)
+            diagnosis = replace(found, index=index)
         except Exception as error:  # it only comments on answers, which must not be lost
             what = f"{type(error).__name__}: {one_line(str(error))}"
             tell(f"note: frame {index} is refused, and its diagnosis failed ({what}); --no-diagnosis leaves it out")

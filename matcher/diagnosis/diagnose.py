@@ -246,6 +246,7 @@ def diagnose(
     *,
     background: Background | None = None,
     seconds: float = 20.0,
+    refused: Match | None = None,
 ) -> Diagnosis:
     """Find the cheapest change of settings that makes a refused frame fit.
 
@@ -267,6 +268,8 @@ def diagnose(
         Background of a matcher of method "nearest", which does not keep it.
     seconds : float
         No further change is tried when this much time has passed; the change that is being tried is finished.
+    refused : Match, optional
+        The answer to the frame, if it is known: it is not matched again.
 
     Returns
     -------
@@ -290,7 +293,7 @@ def diagnose(
         raise UsageError(f"'index' must be in 0 … {len(frames) - 1}, got {index}")
     index %= len(frames)
     frame = frames[index]
-    refused = matcher.match(frame)[0]
+    refused = refused or matcher.match(frame)[0]
     if refused.accepted:
         raise UsageError(f"frame {index} is accepted: there is nothing to diagnose")
     n_returned = int((frame.state == PixelState.RETURN).sum())

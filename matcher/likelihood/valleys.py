@@ -1,7 +1,7 @@
 """Covariances along the valleys of the likelihood, where those of slopes about a solution do not hold.
 
-Where an edge reaches a border of pixels before a background, or of wide pixels, slopes jump. Those about a solution may
-claim an angle that the cost some standard deviations away does not confirm: the valley is flat to one side, or bends.
+Where an edge reaches a border of pixels, slopes jump. Those about a solution may claim an angle that the cost some
+standard deviations away does not confirm: the valley is flat to one side, or bends.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
 
     Each parameter is moved by four standard deviations to both sides, alone and, where pixels are wide or height, pitch
     or roll is free, with the others. Where the cost rises by less than half of what is expected, the part of that
-    parameter is the second moment of its profile likelihood, along the valley. Nothing is done where slopes hold: where
-    pixels are narrow, the camera is level and nothing is behind; nor with a robust loss, flat far away by design.
+    parameter is the second moment of its profile likelihood, along the valley. Nothing is done with a robust loss,
+    which is flat far away by design.
     """
     setup = scene.setup
-    simple = setup.bank.sensor.pixel_rad <= WIDE_PIXEL_RAD and setup.height_and_tilt_are_known
-    if setup.huber is not None or (simple and scene.behind is None):
+    if setup.huber is not None:
         return fits
     best = best_of_frame(fits)
     best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]]
@@ -46,7 +45,8 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     own = fits[best]
     problem = Problem(scene.final, evidence, own.frame, own.class_index, scene.settings())
     theta = np.column_stack([own.view, own.albedo])
-    wide = _along_valleys(problem, problem.at(theta, with_slopes=problem.with_albedo), own.covariance, not simple)
+    together = setup.bank.sensor.pixel_rad > WIDE_PIXEL_RAD or not setup.height_and_tilt_are_known
+    wide = _along_valleys(problem, problem.at(theta, with_slopes=problem.with_albedo), own.covariance, together)
     covariance, std, information = fits.covariance.copy(), fits.std_without_one.copy(), fits.information.copy()
     covariance[best] = wide
     std[best] *= np.sqrt(np.einsum("mpp->mp", wide) / np.einsum("mpp->mp", own.covariance))
