@@ -50,7 +50,8 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     covariance, std, information = fits.covariance.copy(), fits.std_without_one.copy(), fits.information.copy()
     covariance[best] = wide
     std[best] *= np.sqrt(np.einsum("mpp->mp", wide) / np.einsum("mpp->mp", own.covariance))
-    information[best] = covariance_of(wide, 1 / problem.scale[: wide.shape[1]])  # the inverse of a covariance
+    if together:  # elsewhere classes are weighed by their slopes: only the best of them is followed
+        information[best] = covariance_of(wide, 1 / problem.scale[: wide.shape[1]])  # the inverse of a covariance
     return replace(fits, covariance=covariance, std_without_one=std, information=information)
 
 
