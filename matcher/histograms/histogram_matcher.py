@@ -116,9 +116,13 @@ class HistogramMatcher(HistogramSearch):
         return self._answer(fits, (), test, sum(bare), estimated, None)
 
     def _with_slow_rise(self, fits: Found, searches: Sequence[Search], frame: Counted) -> Found:
-        """Return fits, the best one with the information that the cost about it shows where counts vanish there."""
+        """Return fits, the best one with the information that the cost about it shows.
+
+        It is looked for where counts vanish there, and where height, pitch or roll is free: the top of a landmark comes
+        into view to one side alone.
+        """
         best_class, best = _best(fits)
-        if best.straight:
+        if best.straight and not set(self.free) & set(VIEW_FIELDS[3:]):
             return fits
         search, information = searches[best_class], best.information
         columns = [VIEW_FIELDS.index(name) for name in self.free]
