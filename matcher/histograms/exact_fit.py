@@ -279,7 +279,7 @@ class _LinearScene:
         rates = rates[..., :-1] - rates[..., -1:] * (own[:, :-2] / own[:, -2:-1])[:, None]
         for _ in range(rounds):
             covariance = np.linalg.pinv(information, hermitian=True)
-            least = np.sqrt(np.maximum(np.einsum("zja,ab,zjb->zj", rates, covariance, rates), 0.0))
+            least = np.sqrt(np.maximum(((rates @ covariance) * rates).sum(axis=-1), 0.0))
             straight &= bool((well_above * least <= self._sums.level).all())
             if (least <= self._sums.level).all():
                 break
