@@ -108,6 +108,13 @@ class Fits:
             std_without_one=np.pad(self.std_without_one, ((0, 0), (0, more)), constant_values=np.inf),
         )
 
+    def with_rows(self, index: NDArray[np.integer], rows: Fits) -> Fits:
+        """Return the fits with others at some places."""
+        changed = {name: values.copy() for name, values in vars(self).items()}
+        for name, values in changed.items():
+            values[index] = getattr(rows, name)
+        return Fits(**changed)
+
     @classmethod
     def joined(cls, parts: list[Fits]) -> Fits:
         """Put batches behind one another."""

@@ -124,7 +124,7 @@ def look_beside(problem: Problem, state: State) -> State:
     theta[:, turn] += np.tile(sides, len(near))
     there = problem.some(source).turned(state, source, theta)
     d = int(np.flatnonzero(problem.columns == turn)[0])
-    step, gain = step_of_others(problem, there.sums, np.full(len(source), d))
+    step, gain = step_of_others(problem, there.sums, np.tile(np.eye(len(problem.scale))[d], (len(source), 1)))
     rise = (there.sums.cost - gain).reshape(len(near), -1)
     rise -= state.sums.cost[near, None]
     # expected rise beside a single minimum: offset² / var(δ); a rise far below that shows another minimum

@@ -155,12 +155,14 @@ def slopes_along_axes(
 
 
 def step_of_others(
-    problem: Problem, sums: Sums, held: NDArray[np.integer]
+    problem: Problem, sums: Sums, held: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return Gauss–Newton's steps with one parameter of each held, (m, p), and what costs promise to fall by, (m,)."""
-    row, unit = np.arange(len(held)), problem.scale
-    information, gradient = sums.information * np.outer(unit, unit), sums.gradient * unit
-    information[row, held], information[row, :, held], gradient[row, held] = 0.0, 0.0, 0.0
+    """Return Gauss–Newton's steps that are nothing along a vector each, `held` (m, p), and the promised falls, (m,)."""
+    unit = problem.scale
+    normal = held * unit / np.linalg.norm(held * unit, axis=1)[:, None]
+    others = np.eye(normal.shape[1]) - normal[:, :, None] * normal[:, None, :]
+    information = others @ (sums.information * np.outer(unit, unit)) @ others
+    gradient = np.einsum("mpq,mq->mp", others, sums.gradient * unit)
     step = np.einsum("mpq,mq->mp", np.linalg.pinv(information, hermitian=True), gradient)
     return step * unit, np.einsum("mp,mp->m", gradient, step)
 
