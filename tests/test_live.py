@@ -35,7 +35,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.live import Live, Tracker, open_sink, open_source
 from phasemark.matcher.live.map_tracker import MapTracker
-from phasemark.matcher.live.rig_frames import RigLines, open_rig_source
+from phasemark.matcher.live.rig_frames import RecordedRig, RigLines, open_rig_source
 from phasemark.matcher.live.search_beside import SearchesInLine
 from phasemark.matcher.live.sources import SourceFault
 from phasemark.matcher.live.streams import Stream
@@ -702,6 +702,32 @@ def test_zones_of_another_mode_or_damaged_odometry_are_no_frames_and_a_strange_s
     file.write_text("1, 2, 3\n" * 300)
     with pytest.raises(UsageError, match="none of 256 lines is JSON with 'sensor' and 'distances'"):
         list(RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig).frames())
+
+
+def test_lines_of_sensors_with_different_zones_are_one_frame(tmp_path):
+    rig = Rig(sensor=[{"name": "fine"}, {"name": "coarse", "preset": "vl53l5cx-4x4"}])
+    rows = [{"sensor": name, "distances": [1000] * n, "t_ms": 1} for name, n in (("fine", 64), ("coarse", 16))]
+    file = tmp_path / "lines"
+    file.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    source = RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig)
+    frames: Any = [arrival.frames for arrival in source.frames()]
+    assert source.n_damaged == 0
+    np.testing.assert_array_equal(frames[0].depth_m[0, 0], [[1.0] * 8, [1.0] * 4 + [np.nan] * 4])
+
+
+def test_a_sensor_of_a_rig_that_repeats_itself_while_the_robot_moves_is_left_out_and_told(tmp_path):
+    wall_map, rig, path, drive = rig_drive()
+    drive.depth_m[2:, :, 1] = drive.depth_m[1, :, 1]
+    (tmp_path / "drive.npz").write_bytes(recording_bytes(drive, rig))
+    source = RecordedRig(tmp_path / "drive.npz", rig, in_time=False)
+    source.recording = drive  # as a stream has it: frame by frame
+    said: list[str] = []
+    updates, _ = run(source, MapTracker(Locator(wall_map, rig), 0.5, 1.0), said=said)
+    assert [one.located.stuck for one in updates] == [(), (), (), *[("s1",)] * 5]
+    assert [line for line in said if "stuck" in line] == [f"{source.name}: s1 is stuck and left out"]
+    published = [(one.located.estimate.pose, true) for one, true in zip(updates, path, strict=True) if not one.reason]
+    assert len(published) >= 4
+    assert all(np.hypot(*(pose - true)[:2]) < 0.1 for pose, true in published)
 
 
 @pytest.mark.parametrize("kind", ["jsonl", "mcap"])

@@ -23,7 +23,7 @@ STEP = math.radians(45 / 8)
 
 
 def in_space(rig, wall_map):
-    return SpaceModel(rig, wall_map.outline(), rig.numbers(), wall_map, 8)
+    return SpaceModel(rig, wall_map.outline(), rig.numbers(), wall_map)
 
 
 def scan_of(sensors, frames=1):
@@ -100,18 +100,19 @@ def test_a_level_robot_sees_walls_as_the_plane_model_does_and_a_pitch_as_the_clo
     assert_allclose(seen[:3], np.repeat(exact[:3, None], 8, axis=1), rtol=1e-3)  # the rows above the floor
 
 
-def test_sensors_of_different_columns_have_their_zones_in_the_first_columns():
+def test_sensors_of_fewer_zones_have_them_in_the_first_rows_and_columns():
     wide, narrow = {"name": "a", "yaw_deg": 20}, {"name": "b", "yaw_deg": 20, "preset": "vl53l5cx-4x4"}
     one, theta = room(), np.zeros(13)
     theta[:3] = 1.0, 0.8, 0.3
-    scan = Scan(np.zeros(1), np.zeros((1, 2, 32)), np.zeros(1), np.zeros((1, 3)))
+    scan = Scan(np.zeros(1), np.zeros((1, 2, 64)), np.zeros(1), np.zeros((1, 3)))
     parts = [Rig(sensor=[wide, narrow]), Rig(sensor=[narrow])]
     both, alone = (
-        SpaceModel(rig, one.outline(), rig.numbers(), one, 4).prediction(theta[: 9 + 2 * len(rig.sensor)], part)
+        SpaceModel(rig, one.outline(), rig.numbers(), one).prediction(theta[: 9 + 2 * len(rig.sensor)], part)
         for rig, part in zip(parts, (scan, scan._replace(depth_m=np.zeros((1, 1, 16)))), strict=True)
     )
-    seen = both.depth_m[0, 1].reshape(4, 8)
-    assert_allclose(seen[:, :4], alone.depth_m[0, 0].reshape(4, 4))
+    seen = both.depth_m[0, 1].reshape(8, 8)
+    assert_allclose(seen[:4, :4], alone.depth_m[0, 0].reshape(4, 4))
+    assert np.isnan(seen[4:]).all()
     assert np.isnan(seen[:, 4:]).all()
 
 

@@ -53,6 +53,18 @@ def test_a_rig_is_found_within_what_is_stated():
     assert abs(math.degrees(marker[2]) - 2.0) < 0.3  # 30 stops of 0.15° each, and of the sensors' mean yaw
 
 
+def test_poses_of_another_point_of_the_robot_and_a_silent_sensor_are_doubted():
+    """Ten centimetres became 20 mm of range offset, trusted."""
+    rng, one, rig = np.random.default_rng(3), room(), ring_rig(4)
+    poses = free_poses(one, 15, rng)
+    recording = simulated_recording(one, rig, poses, rng, time_s=np.arange(8) / 7.5, moved=TURN)
+    beside = poses + 0.1 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(15)])
+    (doubt,) = calibrate_rig(rig, [recording], [one], [beside]).doubts
+    assert doubt.startswith("poses of simulated, robot 0, are of a point")
+    recording.depth_m[:, :, 1] = np.nan
+    assert calibrate_rig(rig, [recording], [one], [poses]).doubts == ("s1 has no depths",)
+
+
 def test_a_rig_that_is_right_is_not_doubted_for_residuals_that_come_and_go():
     for seed in range(4):
         rng = np.random.default_rng([7, seed])

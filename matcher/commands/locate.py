@@ -244,7 +244,7 @@ def _echo_rig(found: RigCalibration) -> None:
     """Print what changed, the marker frames and the residuals."""
     rows = [(name, sensor, f"{value:+.3f}", f"{std:.3f}", unit) for name, sensor, value, std, unit in found.numbers]
     echo_table(("", "sensor", "change", "±", ""), rows)
-    echo("\nmarker frames, in the body")
+    echo("\nthe body in the frame of each recording's poses")
     frames = [
         (run, str(robot), f"{1e3 * x:+.1f}", f"{1e3 * y:+.1f}", f"{math.degrees(yaw):+.2f}")
         for run, robot, (x, y, yaw) in found.markers

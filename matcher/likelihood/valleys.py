@@ -60,7 +60,7 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
 
 
 def _followed(scene: Scene, evidence: Evidence, fits: Fits) -> tuple[Fits, NDArray[np.float64]]:
-    """Return fits with such covariances, and a view beside each that costs less, (m, 6); NaN if there is none."""
+    """Return fits with these covariances, and a view beside each that costs less, (m, 6); NaN if there is none."""
     problem = Problem(scene.final, evidence, fits.frame, fits.class_index, scene.settings())
     theta = np.column_stack([fits.view, fits.albedo])
     state = problem.at(theta, with_slopes=problem.with_albedo)
@@ -77,7 +77,7 @@ def _followed(scene: Scene, evidence: Evidence, fits: Fits) -> tuple[Fits, NDArr
 class _Axes(NamedTuple):
     """Directions in which the likelihood about some solutions is followed, (k, a, P) each.
 
-    `held` is what a step along the axis changes by one, and steps of all others by nothing; `along` changes all
+    A step along the axis changes `held` by one, and those of all others leave it as it is; `along` changes all
     parameters as the covariance has it, by one standard deviation, `alone` as few as can be.
     """
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from phasemark.matcher.live.tracker import Located, step_between
 from phasemark.matcher.locate import Locator, RigRecording, simulated_recording
 from phasemark.matcher.locate.plane import relative_pose
+from phasemark.matcher.locate.recording import FEWEST_TO_STICK, has_moved, same_depths
 from phasemark.matcher.sequence import Estimate
 
 
@@ -32,6 +33,7 @@ class MapTracker:
         self._prior: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None
         self._stamp_s: float | None = None
         self._odometry: NDArray[np.float64] | None = None
+        self._repeated: tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]] | None = None
 
     def locate(self, frames: RigRecording, stamp_s: float) -> Located:
         """Return the pose at the time of a frame.
@@ -45,6 +47,7 @@ class MapTracker:
         """
         step_s, jumps, note = step_between(self._stamp_s, stamp_s)
         now = None if frames.odometry is None else frames.odometry[0]
+        frames, stuck = self._without_stuck(frames)
         is_late = bool(self.locator.rig.numbers().delay_s.any())
         if is_late and step_s > 0 and not jumps and now is not None and self._odometry is not None:
             earlier = np.concatenate([[-step_s], relative_pose(now, self._odometry)])
@@ -69,7 +72,21 @@ class MapTracker:
         aged_s = 0.0 if moves else float(self.locator.rig.numbers().delay_s.mean())
         if aged_s and now is not None and self._prior is not None:  # the next step of the odometry begins later
             self._prior = self._prior[0], self._prior[1] + np.diag((self._rates * aged_s) ** 2)
-        return Located(estimate, None, None, expected and found.accepted, note=note, aged_s=aged_s)
+        return Located(estimate, None, None, expected and found.accepted, note=note, aged_s=aged_s, stuck=tuple(stuck))
+
+    def _without_stuck(self, frames: RigRecording) -> tuple[RigRecording, list[str]]:
+        """Return a frame without sensors that repeat what they measured before the odometry moved, and their names."""
+        depth = frames.depth_m[0, -1]
+        if frames.odometry is None:
+            return frames, []
+        now = np.tile(frames.odometry[0], (len(depth), 1))
+        before, times, begun = self._repeated or (np.full_like(depth, np.inf), np.zeros(len(depth), np.int64), now)
+        again = same_depths(depth, before) & np.isfinite(depth).any(axis=1)
+        times, begun = np.where(again, times + 1, 1), np.where(again[:, None], begun, now)
+        self._repeated = depth, times, begun
+        stuck = (times >= FEWEST_TO_STICK) & has_moved(np.abs(now - begun))
+        names = [name for name, one in zip(self.locator.rig.names, stuck, strict=True) if one]
+        return (frames.without(np.broadcast_to(stuck, frames.depth_m.shape[:3])) if names else frames), names
 
     def warm(self) -> None:
         """Locate a simulated frame, with a start and without: kernels are there before the first frame is."""

@@ -13,7 +13,6 @@ import numpy as np
 
 from phasemark import InputFileError, UsageError
 from phasemark.data.measured.board_prints import of_object, plain
-from phasemark.data.plans.bank_plan import sensor_of
 from phasemark.matcher.live.sources import LONGEST_LINE, Arrival, Replay, StreamSource
 from phasemark.matcher.live.streams import Lines, Stream, open_stream
 from phasemark.matcher.locate import Rig, RigRecording, read_rig_recording
@@ -42,7 +41,8 @@ class RigLines(StreamSource):
     def __init__(self, stream: Stream, rig: Rig) -> None:
         super().__init__(stream)
         self._rig, self._heard, self._n_frames = rig, set[str](), 0
-        self._rows = max(sensor_of(one.preset, {}).rows for one in rig.sensor)
+        rows = [rows for rows, _ in rig.rows()]
+        self._zones = dict(zip(rig.names, zip(rows, rig.numbers().columns.tolist(), strict=True), strict=True))
 
     def _parsed(self, lines: Lines) -> Iterator[Arrival]:
         held: dict[str, dict[str, Any]] = {}
@@ -76,24 +76,29 @@ class RigLines(StreamSource):
 
     def _row(self, text: str) -> dict[str, Any]:
         """Return what a line holds: the sensor, zones in metres, their status, a time and the odometry, if any."""
-        printed, columns = of_object(0, text), int(self._rig.numbers().columns.max())
-        n, rows = len(printed.distance_mm), self._rows
-        if printed.damage or n not in (columns, rows * columns):
-            raise InputFileError(f"{self.name}: {printed.damage or f'{n} zones, the sensor has {rows} × {columns}'}")
+        printed = of_object(0, text)
+        if printed.damage:
+            raise InputFileError(f"{self.name}: {printed.damage}")
         given = json.loads(text)
         name, odometry = given.get("sensor"), given.get("odometry")
-        if name not in self._rig.names:
+        if name not in self._zones:
             raise UsageError(f"{self.name}: frames name the sensor {name!r}, the rig has {', '.join(self._rig.names)}")
+        n, (rows, columns) = len(printed.distance_mm), self._zones[name]
+        if n not in (columns, rows * columns):
+            raise InputFileError(f"{self.name}: {n} zones, the sensor has {rows} × {columns}")
         if odometry is not None:
             try:
                 odometry = np.array(odometry, np.float64).reshape(3) * [1, 1, np.radians(1)]
             except (TypeError, ValueError, OverflowError):
                 raise InputFileError(f"{self.name}: 'odometry' must be [x_m, y_m, yaw_deg]") from None
-        shape = (n,) if n == columns else (n // columns, columns)
-        status = printed.status or [self._rig.reduction.valid_status[0]] * n
-        zones = 1e-3 * np.reshape(printed.distance_mm, shape)
-        return {"sensor": name, "z_m": zones, "status": np.reshape(status, shape), "time_s": printed.time_s,
-                "odometry": odometry}  # fmt: skip
+        shape = (n,) if n == columns else (rows, columns)
+        most = np.max(list(self._zones.values()), axis=0)[-len(shape) :]
+        own = tuple(slice(size) for size in shape)
+        zones, status = np.full(most, np.nan), np.full(most, self._rig.reduction.valid_status[0])
+        zones[own] = 1e-3 * np.reshape(printed.distance_mm, shape)
+        if printed.status:
+            status[own] = np.reshape(printed.status, shape)
+        return {"sensor": name, "z_m": zones, "status": status, "time_s": printed.time_s, "odometry": odometry}
 
     def _frame(self, held: dict[str, dict[str, Any]]) -> Arrival:
         """Return lines of several sensors as one frame, invalid where a sensor sent nothing."""

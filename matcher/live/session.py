@@ -60,7 +60,7 @@ class Live:
         self._is_over, self._error = threading.Event(), list[Exception]()
         self._number = -1
         self._offset_s: float | None = None
-        self._held = 0
+        self._held, self._stuck = 0, tuple[str, ...]()
         self._to_unix_s = time.time() - time.monotonic()
 
     def stop(self) -> None:
@@ -155,7 +155,9 @@ class Live:
         if located.note:
             self._held, self._offset_s = _SETTLES, None
             self._say(f"{self.source.name}: {located.note}")
-        reason = located.estimate.reason
+        if located.stuck != self._stuck:
+            self._say(f"{self.source.name}: {', '.join(located.stuck) or 'no sensor'} is stuck and left out")
+        self._stuck, reason = located.stuck, located.estimate.reason
         if self._held:
             self._held, reason = self._held - 1, reason or "clock"
         latency_s = time.monotonic() - arrival.received_s

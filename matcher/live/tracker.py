@@ -44,6 +44,8 @@ class Located:
         What was noticed: a jump of the clock.
     aged_s : float
         By how much the pose is older than the frame's stamp, beside the delay of the sensor.
+    stuck : tuple of str
+        Sensors of a rig that repeat what they measured before the robot moved: they were left out.
     """
 
     estimate: Estimate
@@ -53,6 +55,7 @@ class Located:
     searched: int | None = None
     note: str = ""
     aged_s: float = 0.0
+    stuck: tuple[str, ...] = ()
 
 
 class Locator(Protocol):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -193,7 +194,6 @@ class Locator:
             )
         self._grid = pose_grid(self.model.outline, rig.noise.max_range_m)
         self.with_tilt = with_tilt
-        self._in_space: dict[int, SpaceModel] = {}
 
     def locate(
         self,
@@ -311,10 +311,13 @@ class Locator:
             return None
         if recording.zone_m is None:
             raise UsageError(f"z, pitch and roll need rows of zones, and '{recording.run}' has columns alone")
-        rows, scan = recording.zone_m.shape[3], recording.zones(k, _SAME_FRAMES)
-        if rows not in self._in_space:
-            self._in_space[rows] = SpaceModel(self.rig, self.model.outline, self.model.numbers, self.wall_map, rows)
-        return None if scan is None else (self._in_space[rows], scan)
+        scan = recording.zones(k, _SAME_FRAMES)
+        return None if scan is None else (self._in_space, scan)
+
+    @cached_property
+    def _in_space(self) -> SpaceModel:
+        """The model of zones, made when it is first needed."""
+        return SpaceModel(self.rig, self.model.outline, self.model.numbers, self.wall_map)
 
     def locate_scan(
         self,

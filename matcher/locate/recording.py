@@ -18,7 +18,7 @@ from phasemark.data.measured.recording import npz_arrays
 from phasemark.inputs import read_text, read_whole
 from phasemark.inputs.table_cells import cells_of, finite_number
 from phasemark.matcher.locate.kernel_arguments import Scan
-from phasemark.matcher.locate.rig import Rig
+from phasemark.matcher.locate.rig import Rig, elevations_rad
 
 _Float = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ _FASTEST_M_S, _FASTEST_RAD_S = 5.0, 12.0
 """Odometry that moves faster between two frames has jumped."""
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
 """While a robot moves by more, no sensor returns the same depths at each frame."""
-_FEWEST_TO_STICK = 3
+FEWEST_TO_STICK = 3
 """Frames that must agree to the last digit before a sensor counts as stuck."""
 
 
@@ -113,9 +113,9 @@ class RigRecording:
         if not 1 <= n <= self.depth_m.shape[1]:
             raise UsageError(f"'frames' must be 1 … {self.depth_m.shape[1]}, got {n}")
         later = np.arange(self.depth_m.shape[1]) >= n
-        return self._without(np.broadcast_to(later[:, None], self.depth_m.shape[:3]))
+        return self.without(np.broadcast_to(later[:, None], self.depth_m.shape[:3]))
 
-    def _without(self, dropped: NDArray[np.bool_]) -> Self:
+    def without(self, dropped: NDArray[np.bool_]) -> Self:
         """Return the recording without what some sensors measured in some frames, (n, F, S)."""
         zones = None if self.zone_m is None else np.where(dropped[..., None, None], np.nan, self.zone_m)
         return replace(self, depth_m=np.where(dropped[..., None], np.nan, self.depth_m), zone_m=zones)
@@ -235,14 +235,19 @@ def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, r
     for name in rig.names:
         if name not in names:
             raise InputFileError(f"{path}: no sensor '{name}' of the rig, got {', '.join(names)}")
-    columns = rig.numbers().columns
-    if depth.shape[-1] != columns.max():
-        raise InputFileError(f"{path}: has {depth.shape[-1]} columns, but the sensors of the rig {columns.max()}")
+    most = {"columns": rig.numbers().columns.max()}
+    if depth.ndim == 5:
+        most["rows"] = max(rows for rows, _ in rig.rows())
+    for (word, allowed), got in zip(most.items(), (depth.shape[-1], depth.shape[3]), strict=False):
+        if got != allowed:
+            raise InputFileError(f"{path}: has {got} {word}, but the sensors of the rig {allowed}")
     return np.ascontiguousarray(depth[:, :, [names.index(name) for name in rig.names]], dtype=np.float64)
 
 
 def reduced_rows(zones_m: _Float, rig: Rig) -> _Float:
     """Return the depths of columns, (n, F, S, C), each of the valid zones in the rows that the rig names.
+
+    Depths of rows of a sensor that is pitched are made those of the rows' mean, for walls.
 
     Raises
     ------
@@ -250,8 +255,12 @@ def reduced_rows(zones_m: _Float, rig: Rig) -> _Float:
         The sensors do not have these rows.
     """
     first, last = rig.reduction.rows or (0, zones_m.shape[3] - 1)
-    if not first <= last < zones_m.shape[3]:
-        raise UsageError(f"'reduction.rows' of the rig must be within its {zones_m.shape[3]} rows, got {first, last}")
+    if not first <= last < (fewest := min(rows for rows, _ in rig.rows())) and rig.reduction.rows:
+        raise UsageError(f"'reduction.rows' of the rig must be within its {fewest} rows, got {first, last}")
+    zones_m = zones_m.copy()
+    for s, level in enumerate(rig.levels()):
+        if len(level) > 1:
+            zones_m[:, :, s, first : last + 1] *= (level / level.mean())[:, None]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a column without a valid row is NaN
         reduce = np.nanmedian if rig.reduction.how == "median" else np.nanmean
@@ -270,12 +279,13 @@ def _as_depth(depth: _Float, quantity: str, rig: Rig) -> _Float:
     """Return distances along the boresight."""
     if quantity == "z":
         return depth
-    numbers = rig.numbers()
-    across = np.tan((0.5 * (numbers.columns[:, None] - 1) - np.arange(depth.shape[-1])) * numbers.step_rad[:, None])
+    columns, step = rig.numbers().columns[:, None], rig.column_steps_rad()[:, None]
+    across = np.tan((0.5 * (columns - 1) - np.arange(depth.shape[-1])) * step)
     if depth.ndim == 4:
         return np.asarray(depth / np.hypot(1.0, across))
-    rows = depth.shape[3]
-    up = np.tan((0.5 * (rows - 1) - np.arange(rows)) * rig.row_steps_rad()[:, None])
+    up = np.full((len(across), depth.shape[3]), np.nan)  # which a sensor with fewer rows has not
+    for of_sensor, own in zip(up, rig.rows(), strict=True):
+        of_sensor[: own[0]] = np.tan(elevations_rad(*own))
     return np.asarray(depth / np.sqrt(1.0 + across[:, None] ** 2 + up[:, :, None] ** 2))
 
 
@@ -301,26 +311,46 @@ def _odometry(arrays: Mapping[str, NDArray[Any]], path: Path, n: int, frames: in
 
 def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
     """Leave out sensors that are stuck while the robot moves, and note them and odometry that jumps."""
-    depth, notes = recording.depth_m, []
-    stuck = np.zeros(depth.shape[:3], np.bool_)
+    stuck, notes = _stuck(recording), []
     for k in range(len(recording)):
         moved = recording.moved[k]
-        found = []
-        is_moving = np.ptp(moved[:, :2], axis=0).max() > _MOVED_M or np.ptp(moved[:, 2]) > _TURNED_RAD
-        for s, name in enumerate(rig.names):
-            own = depth[k, :, s][np.isfinite(depth[k, :, s]).any(axis=1)]
-            if (
-                is_moving
-                and len(own) >= _FEWEST_TO_STICK
-                and np.array_equal(own, np.broadcast_to(own[0], own.shape), True)
-            ):
-                stuck[k, :, s] = True
-                found.append(f"{name} is stuck")
+        found = [f"{name} is stuck" for name, one in zip(rig.names, stuck[k].any(axis=0), strict=True) if one]
         step = np.abs(np.diff(moved, axis=0)) / np.diff(recording.time_s[k])[:, None]
         if (step[:, :2] > _FASTEST_M_S).any() or (step[:, 2] > _FASTEST_RAD_S).any():
             found.append("odometry jumps")
         notes.append(", ".join(found))
-    return replace(recording._without(stuck), notes=tuple(notes))
+    return replace(recording.without(stuck), notes=tuple(notes))
+
+
+def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
+    """Return which frames of which sensors, (n, F, S), repeat others though the odometry has moved."""
+    (n, frames, sensors), poses = recording.depth_m.shape[:3], recording.moved
+    series, stuck = np.arange(n), np.zeros((n, frames, sensors), np.bool_)
+    if recording.odometry is not None:  # else frames are compared within a stop alone
+        series, (yaw, moved) = recording.robot, (recording.odometry[:, None, 2], recording.moved)
+        x, y = (np.cos(yaw) * moved[..., k] + by * np.sin(yaw) * moved[..., 1 - k] for k, by in ((0, -1), (1, 1)))
+        poses = recording.odometry[:, None] + np.stack([x, y, moved[..., 2]], axis=-1)
+    for one in np.unique(series):
+        k, f = np.repeat(np.flatnonzero(series == one), frames), np.tile(np.arange(frames), (series == one).sum())
+        for s in range(sensors):
+            seen = np.isfinite(recording.depth_m[k, f, s]).any(axis=1)
+            own_k, own_f = k[seen], f[seen]
+            depth = recording.depth_m[own_k, own_f, s]
+            runs = np.cumsum(np.r_[False, ~same_depths(depth[1:], depth[:-1])])[: len(depth)]
+            for run in np.flatnonzero(np.bincount(runs) >= FEWEST_TO_STICK):
+                where = own_k[runs == run], own_f[runs == run], s
+                stuck[where] = has_moved(np.ptp(poses[where[:2]], axis=0))
+    return stuck
+
+
+def same_depths(one: _Float, other: _Float) -> NDArray[np.bool_]:
+    """Return which sensors measured the same to the last digit, (…,), of depths (…, C)."""
+    return np.asarray(((one == other) | np.isnan(one) & np.isnan(other)).all(axis=-1))
+
+
+def has_moved(way: _Float) -> NDArray[np.bool_]:
+    """Return whether steps x, y (m), yaw (rad), (…, 3), are so long that no sensor measures the same at both ends."""
+    return np.asarray((way[..., :2].max(axis=-1) > _MOVED_M) | (way[..., 2] > _TURNED_RAD))
 
 
 def read_stop_poses(path: str | os.PathLike[str]) -> dict[tuple[str, int, int], _Float]:

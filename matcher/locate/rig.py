@@ -21,8 +21,12 @@ from phasemark.matcher.locate.wall_map import WallMap
 
 _Float = NDArray[np.float64]
 _Number = Annotated[float, Field(allow_inf_nan=False)]
-_Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_Size = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+_Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
+_Size = Annotated[float, Field(ge=0, le=1e6)]
+
+
+_LEAST_LEVEL = 0.05
+"""How far along the level a row must see, at least, for a depth of one."""
 
 
 class SensorStd(PlanModel):
@@ -48,14 +52,14 @@ class RigSensor(PlanModel):
     x_m, y_m, z_m : float
         Place in the robot's frame: x forward, y left.
     yaw_deg, pitch_deg : float
-        Direction of the boresight; a pitch lengthens the distance to a vertical wall by 1 / cos.
+        Direction of the boresight; a positive pitch looks down, and lengthens depths of a vertical wall.
     roll_deg : 0 or 180
         A sensor upside down has its columns the other way round.
     delay_s : float
         Age of its data when the odometry of a frame is read.
     range_offset_m, range_scale : float
         A depth d is reported as scale · d + offset.
-    columns : int, optional
+    columns, rows : int, optional
     fov_deg : float, optional
         Full horizontal field of view.
     footprint_columns : float
@@ -75,6 +79,7 @@ class RigSensor(PlanModel):
     range_offset_m: _Number = 0.0
     range_scale: _Positive = 1.0
     columns: Annotated[int, Field(ge=1, le=4096)] | None = None
+    rows: Annotated[int, Field(ge=1, le=4096)] | None = None
     fov_deg: Annotated[float, Field(gt=0, lt=120)] | None = None
     footprint_columns: Annotated[float, Field(gt=0, le=10)] = 2.5
     std: SensorStd = SensorStd()
@@ -195,15 +200,10 @@ class Rig(PlanModel):
         """
         rows = []
         for one in self.sensor:
-            columns, fov = one.columns, one.fov_deg
-            if columns is None or fov is None:
-                base = sensor_of(one.preset, {})
-                columns = columns or base.cols
-                fov = fov or 2 * float(base.half_angle_h_deg)
-            step = math.radians(fov) / columns * (1 if one.roll_deg == 0 else -1)
-            scale = one.range_scale / math.cos(math.radians(one.pitch_deg))
-            rows.append((math.radians(one.yaw_deg), one.x_m, one.y_m, one.delay_s, one.range_offset_m, scale, step,
-                         columns, one.footprint_columns))  # fmt: skip
+            columns, step = _columns_of(one)
+            level = float(self._level(one).mean())
+            rows.append((math.radians(one.yaw_deg), one.x_m, one.y_m, one.delay_s, one.range_offset_m,
+                         one.range_scale / level, step / level, columns, one.footprint_columns))  # fmt: skip
         yaw, x, y, delay, offset, gain, steps, n, footprint = np.array(rows, dtype=np.float64).T.copy()
         return RigNumbers(yaw, x, y, delay, offset, gain, steps, n.astype(np.int64), footprint)
 
@@ -233,13 +233,34 @@ class Rig(PlanModel):
                 )
         return outlines[len(outlines) // 2]
 
-    def row_steps_rad(self) -> _Float:
-        """Return the angle between neighbouring rows of each sensor, (S,), in the proportion of its preset."""
-        steps = []
-        for one, across in zip(self.sensor, np.abs(self.numbers().step_rad), strict=True):
-            base = sensor_of(one.preset, {})
-            steps.append(across * float(base.half_angle_v_deg) * base.cols / (float(base.half_angle_h_deg) * base.rows))
-        return np.array(steps)
+    def column_steps_rad(self) -> _Float:
+        """Return the angle between neighbouring columns of each sensor, (S,), less than 0 of one that is upside down.
+
+        That of :class:`~phasemark.matcher.locate.kernel_arguments.RigNumbers` is the angle in the level.
+        """
+        return np.array([_columns_of(one)[1] for one in self.sensor])
+
+    def rows(self) -> list[tuple[int, float]]:
+        """Return the number of rows of each sensor, and the angle between neighbours."""
+        return [_rows_of(one) for one in self.sensor]
+
+    def levels(self) -> list[_Float]:
+        """Return how far along the level the rows that are reduced see for a depth of one, one array a sensor."""
+        return [self._level(one) for one in self.sensor]
+
+    def _level(self, one: RigSensor) -> _Float:
+        """Return that of one sensor."""
+        pitch = math.radians(one.pitch_deg)
+        if pitch == 0 or self.reduction.rows is None:  # what is above the boresight makes up for what is below
+            return np.full(1, math.cos(pitch))
+        (first, last), (rows, step) = self.reduction.rows, _rows_of(one)
+        if not first <= last < rows:
+            raise UsageError(f"'reduction.rows' of the rig must be within its {rows} rows, got {first, last}")
+        above = elevations_rad(rows, step)[first : last + 1] * (1 if one.roll_deg == 0 else -1)
+        level: _Float = math.cos(pitch) + np.tan(above) * math.sin(pitch)
+        if level.min() < _LEAST_LEVEL:
+            raise UsageError(f"'pitch_deg' of {one.name} must let rows {first, last} see ahead, got {one.pitch_deg:g}")
+        return level
 
     def with_numbers(self, numbers: RigNumbers, std: Mapping[str, _Float]) -> Self:
         """Return the rig with calibrated numbers and their standard deviations.
@@ -250,7 +271,7 @@ class Rig(PlanModel):
         std : mapping of str to (S,) float64
             By the names of :class:`SensorStd`, in its units.
         """
-        sensors = []
+        sensors, levels = [], self.levels()
         for k, one in enumerate(self.sensor):
             update: dict[str, Any] = {
                 "yaw_deg": math.degrees(numbers.yaw_rad[k]),
@@ -258,8 +279,8 @@ class Rig(PlanModel):
                 "y_m": float(numbers.y_m[k]),
                 "delay_s": float(numbers.delay_s[k]),
                 "range_offset_m": float(numbers.offset_m[k]),
-                "range_scale": float(numbers.scale[k]) * math.cos(math.radians(one.pitch_deg)),
-                "fov_deg": math.degrees(abs(numbers.step_rad[k])) * int(numbers.columns[k]),
+                "range_scale": float(numbers.scale[k] * levels[k].mean()),
+                "fov_deg": math.degrees(abs(numbers.step_rad[k]) * levels[k].mean()) * int(numbers.columns[k]),
                 "columns": int(numbers.columns[k]),
                 "std": one.std.model_copy(update={name: float(value[k]) for name, value in std.items()}),
             }
@@ -296,3 +317,25 @@ def read_rig(path: str | os.PathLike[str]) -> Rig:
         With one line that names the file, the key, the value and what would be right.
     """
     return read_plan(path, Rig)
+
+
+def _columns_of(one: RigSensor) -> tuple[int, float]:
+    """Return the number of columns of a sensor, and the angle between neighbours, less than 0 if it is upside down."""
+    columns, fov = one.columns, one.fov_deg
+    if columns is None or fov is None:
+        base = sensor_of(one.preset, {})
+        columns = columns or base.cols
+        fov = fov or 2 * float(base.half_angle_h_deg)
+    return columns, math.radians(fov) / columns * (1 if one.roll_deg == 0 else -1)
+
+
+def _rows_of(one: RigSensor) -> tuple[int, float]:
+    """Return the number of rows of a sensor, and the angle between neighbours, in the proportion of its preset."""
+    base, (columns, step) = sensor_of(one.preset, {}), _columns_of(one)
+    rows = one.rows or base.rows
+    return rows, abs(step) * columns / rows * float(base.half_angle_v_deg) / float(base.half_angle_h_deg)
+
+
+def elevations_rad(rows: int, step_rad: float) -> _Float:
+    """Return the elevation of each row above the boresight, (rows,), row 0 the highest."""
+    return np.asarray((0.5 * (rows - 1) - np.arange(rows)) * step_rad, np.float64)

@@ -57,7 +57,7 @@ _PARAMETERS = {
     "fov": _Parameter("fov", "step_rad", "fov_deg", math.radians(1.0), STEP, (1.0, "of itself"), common=True),
 }
 _MARKER_STD = (0.005, 0.005, math.radians(3.0))
-"""Of a marker frame in the body: x, y (m), yaw (rad)."""
+"""Of the body in the frame of its markers: x, y (m), yaw (rad)."""
 _TRUTH_STD = (0.002, 0.002, math.radians(0.15))
 """Of a measured pose, beside the part of the map."""
 _DOUBTFUL = 2.0
@@ -81,7 +81,7 @@ class RigCalibration:
     numbers : tuple of (name, sensor, value, std, unit)
         Every estimated number; the sensor is "" where all share it.
     markers : tuple of (recording, robot, (3,) float64)
-        x, y (m), yaw (rad) of the marker frame in the body.
+        x, y (m), yaw (rad) of the body in the frame that the poses are of.
     wall_m : tuple of (walls,) float64
         By how much the walls of each map are displaced along their normals.
     rms : (before, after)
@@ -326,9 +326,19 @@ class _Problem:
                     doubts.append(f"{name} of {sensor or 'all'} moved by {off:.1f} prior standard deviations")
             own = std[place] * _unit(name, self.numbers) / one.unit_of_std
             of_rig[one.std] = np.maximum(own, of_rig.get(one.std, 0.0))
+        for r, robot in self.groups:
+            off = np.abs(self.value[self.place[r, robot]] / _MARKER_STD)
+            if off.max() > _FAR:
+                x, y, yaw = self.value[self.place[r, robot]]
+                doubts.append(
+                    f"poses of {self.recordings[r].run}, robot {robot}, are of a point {1e3 * math.hypot(x, y):.0f}"
+                    f" mm from the robot's, {math.degrees(yaw):.1f}° off"
+                )
         least_explained, growth = 0.7, 0.05  # a rig that was right has residuals that come and go by less
         for name, (explained, observed) in zip(self.rig.names, self.columns.T, strict=True):
-            if explained < least_explained * observed:
+            if not observed:
+                doubts.append(f"{name} has no depths")
+            elif explained < least_explained * observed:
                 share = f"{100 * explained / observed:.0f} % of the columns of {name} are explained"
                 doubts.append(f"{share}, {100 * least_explained:.0f} % are needed")
         if last > first + growth:

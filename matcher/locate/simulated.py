@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark.data.plans.bank_plan import sensor_of
 from phasemark.matcher.locate.kernel_arguments import Scan
 from phasemark.matcher.locate.plane import relative_pose
 from phasemark.matcher.locate.recording import RigRecording, reduced_rows
@@ -53,8 +52,8 @@ def simulated_recording(
     parts, noise, rows = (rig, rig.outline_of(wall_map, in_space=truth.shape[1] == 6), rig.numbers()), rig.noise, 1
     model = StopModel(*parts)
     if truth.shape[1] == 6:
-        rows = max(sensor_of(one.preset, {}).rows for one in rig.sensor)
-        model = SpaceModel(*parts, wall_map, rows)
+        rows = max(rows for rows, _ in rig.rows())
+        model = SpaceModel(*parts, wall_map)
     std, columns = model.unknowns_std, model.numbers.columns
     shape = (len(times), len(columns), rows * int(columns.max()))
     depth = np.empty((len(truth), *shape))

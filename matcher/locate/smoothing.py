@@ -21,6 +21,14 @@ _Float = NDArray[np.float64]
 
 _FALSE_ALARM = 1e-4
 """Probability with which an accepted pose that is right is left out for disagreeing with the others."""
+_SLIP = 1e-6
+"""The same of a step of the odometry, whose errors are less like those of a normal law."""
+_AS_WELL = 0.99
+"""Share of the largest disagreement of a measurement with which a step is left out before it."""
+_OFTEN = 0.15
+"""Share of the steps that do not hold from which the odometry is not believed."""
+_LEAST_KNOWN = 1e-6
+"""Inverse squares of metres and radians: no stop is farther off than a kilometre, though a corridor does not say."""
 _MOST_STEPS = 10
 
 
@@ -28,9 +36,9 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
     """Return answers joined by the odometry between the stops of each robot.
 
     What the frames of accepted stops speak for are measurements, and of undetermined ones that no other pose explains
-    and that do tell each of x, y and yaw. A measurement that disagrees with
-    the rest by χ² is left out. A stop that was ambiguous or explained poorly is located again with the poses around as
-    its prior. An answer is accepted if its stop takes part and its pose is determined then.
+    and that do tell each of x, y and yaw. What disagrees most with the rest by χ² is left out, a measurement or a step
+    of the odometry: wheels slip. A stop that was ambiguous or explained poorly is located again with the poses around
+    as its prior. An answer is accepted if its stop takes part and its pose is determined then.
 
     Parameters
     ----------
@@ -60,15 +68,18 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         used = np.array([_is_measurement(found[k]) for k in own])
         if not used.any():
             continue
-        poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
+        poses, covariance, used, _ = _Chain([found[k] for k in own], steps, drift).solved(used)
         for k, pose, around in zip(own[~used], poses[~used], covariance[~used], strict=True):
             if found[k].reason in ("ambiguous", "poor fit", "unexpected"):
                 zones = locator.zones(recording, int(k))
-                again = locator.locate_scan(recording.scan(int(k)), (pose, around + part), zones)
-                if again.accepted:
-                    found[k] = replace(again, key=found[k].key, note=found[k].note)
-        used |= [found[k].accepted and bool(u or answers[k].reason) for k, u in zip(own.tolist(), used, strict=True)]
-        poses, covariance, used = _Chain([found[k] for k in own], steps, drift).solved(used)
+                one = locator.locate_scan(recording.scan(int(k)), (pose, around + part), zones)
+                if one.accepted:
+                    found[k] = replace(one, key=found[k].key, note=found[k].note)
+        alone = np.array([answers[k].accepted for k in own.tolist()])
+        used |= np.array([found[k].accepted for k in own]) & ~alone
+        poses, covariance, used, chain = _Chain([found[k] for k in own], steps, drift).solved(used)
+        if chain[-1] > _OFTEN * len(steps):  # only stops that were accepted alone speak for those near them
+            used &= np.isin(chain, chain[used & alone])
         for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
             found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found
@@ -107,57 +118,76 @@ class _Chain:
         self.steps = steps
         self.precision = np.array([np.linalg.inv(drift.covariance(step)) for step in steps]).reshape(-1, 3, 3)
 
-    def solved(self, used: NDArray[np.bool_]) -> tuple[_Float, _Float, NDArray[np.bool_]]:
-        """Return poses, covariances, and which measurements agree with the rest."""
-        used = used.copy()
-        limit = float(chi2.isf(_FALSE_ALARM, 3))
+    def solved(self, used: NDArray[np.bool_]) -> tuple[_Float, _Float, NDArray[np.bool_], NDArray[np.int64]]:
+        """Return poses, covariances, which measurements agree with the rest, and which stops whole steps join."""
+        used, whole, n = used.copy(), np.ones(len(self.steps), np.bool_), len(used)
+        limit, slip = float(chi2.isf(_FALSE_ALARM, 3)), float(chi2.isf(_SLIP, 3))
         while True:
-            poses, covariance = self._fitted(used)
-            distance = np.full(len(used), -np.inf)
+            poses, covariance = self._fitted(used, whole)
+            step_off, measured_off = np.zeros(len(whole)), np.zeros(n)
             for k in np.flatnonzero(used):
                 off = difference(self.measured[k], poses[k])
-                # the covariance of a residual is that of the measurement less that of the fit: Λ⁻¹ − C
-                pulled = self.weight[k] @ off
-                spread = self.weight[k] - self.weight[k] @ covariance[k] @ self.weight[k]
-                distance[k] = pulled @ np.linalg.pinv(spread, rcond=1e-6, hermitian=True) @ pulled
-            worst = int(np.argmax(distance))
-            if distance[worst] <= limit or used.sum() < 3:
-                return poses, covariance, used
-            used[worst] = False
+                measured_off[k] = _surprise(off, self.weight[k], covariance[k, :, k])
+            for k in np.flatnonzero(whole):
+                off = difference(self.steps[k], relative_pose(poses[k], poses[k + 1]))
+                slope = _step_slope(poses[k], poses[k + 1])
+                of_both = covariance[k : k + 2, :, k : k + 2].reshape(6, 6)
+                step_off[k] = _surprise(off, self.precision[k], slope @ of_both @ slope.T)
+            slipped = step_off.max(initial=0.0) > slip
+            if not slipped and measured_off.max() <= limit:
+                return poses, covariance[np.arange(n), :, np.arange(n)], used, np.cumsum(np.r_[0, ~whole])
+            # between two measurements neither is known to be wrong, and the step is
+            if slipped and step_off.max() >= _AS_WELL * measured_off.max():
+                whole[np.argmax(step_off)] = False
+            else:
+                used[np.argmax(measured_off)] = False
 
-    def _fitted(self, used: NDArray[np.bool_]) -> tuple[_Float, _Float]:
-        """Return the least-squares poses, (n, 3), and their covariances, (n, 3, 3)."""
+    def _fitted(self, used: NDArray[np.bool_], whole: NDArray[np.bool_]) -> tuple[_Float, _Float]:
+        """Return the least-squares poses, (n, 3), and their covariance, (n, 3, n, 3), by what is used."""
         n = len(self.measured)
-        poses = self._started(used)
+        poses = self._started(used, whole)
         for _ in range(_MOST_STEPS):
-            normal, pull = np.zeros((3 * n, 3 * n)), np.zeros(3 * n)
+            normal, pull = _LEAST_KNOWN * np.eye(3 * n), np.zeros(3 * n)
             for k in range(n):
                 own = slice(3 * k, 3 * k + 3)
                 if used[k]:
                     normal[own, own] += self.weight[k]
                     pull[own] += self.weight[k] @ difference(self.measured[k], poses[k])
-                if k + 1 < n:
+                if k + 1 < n and whole[k]:
                     both, slope = slice(3 * k, 3 * k + 6), _step_slope(poses[k], poses[k + 1])
                     weighted = slope.T @ self.precision[k]
                     normal[both, both] += weighted @ slope
                     pull[both] += weighted @ difference(self.steps[k], relative_pose(poses[k], poses[k + 1]))
-            covariance: _Float = np.asarray(np.linalg.inv(normal), np.float64)
+            scale = 1 / np.sqrt(np.diag(normal))  # some stops tell millimetres, some next to nothing
+            covariance: _Float = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
             step = (covariance @ pull).reshape(n, 3)
             poses = poses + step
             if np.abs(step).max() < 1e-9:
                 break
-        return poses, covariance.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n)]
+        return poses, covariance.reshape(n, 3, n, 3)
 
-    def _started(self, used: NDArray[np.bool_]) -> _Float:
-        """Return poses to begin with: those that were measured, and from the nearest of them along the odometry."""
+    def _started(self, used: NDArray[np.bool_], whole: NDArray[np.bool_]) -> _Float:
+        """Return poses to begin with: those that were measured, and from the nearest of them along whole steps."""
         poses, known, n = self.measured.copy(), used.copy(), len(used)
         for k in [*range(1, n), *range(n - 2, -1, -1)]:
-            if not known[k] and k and known[k - 1]:
+            if not known[k] and k and known[k - 1] and whole[k - 1]:
                 poses[k], known[k] = stepped(poses[k - 1], self.steps[k - 1]), True
-            elif not known[k] and k + 1 < n and known[k + 1]:
+            elif not known[k] and k + 1 < n and known[k + 1] and whole[k]:
                 back = relative_pose(self.steps[k], np.zeros(3))
                 poses[k], known[k] = stepped(poses[k + 1], back), True
         return poses
+
+
+def _surprise(off: _Float, weight: _Float, covariance: _Float) -> float:
+    """Return the squared residual over its covariance, that of the measurement less that of the fit: Λ⁻¹ − C.
+
+    Nothing is unexpected in what no other evidence speaks of.
+    """
+    known = np.diag(weight)
+    scale = np.where(known > 0, 1 / np.sqrt(np.where(known > 0, known, 1.0)), 0.0)
+    variance, axes = np.linalg.eigh((weight - weight @ covariance @ weight) * np.outer(scale, scale))
+    pulled, shared = axes.T @ (scale * (weight @ off)), variance > 1e-6
+    return float((pulled[shared] ** 2 / variance[shared]).sum())
 
 
 def _step_slope(before: _Float, after: _Float) -> _Float:

@@ -219,17 +219,18 @@ class WallMap(PlanModel):
         if not len(self.wall) + len(self.walls_m) + len(self.box) + len(self.mesh) + len(self.landmark):
             raise UsageError("'wall' must name at least one wall, or 'box', 'mesh' or 'landmark' a body")
         walls = self.walls
+        ends = np.array([one.ends_m for one in walls]).reshape(-1, 4)
         for k, one in enumerate(walls):
             if math.dist(one.from_m, one.to_m) < _TOUCH_M:
                 raise UsageError(
                     f"'{self._key(k)}' must be longer than {1e3 * _TOUCH_M:g} mm, got {one.ends_m.tolist()}"
                 )
-            for j, other in enumerate(walls[:k]):
-                if _cross(one.ends_m, other.ends_m):
-                    raise UsageError(
-                        f"'{self._key(k)}' must not cross '{self._key(j)}': cut walls where they meet,"
-                        f" got {one.ends_m.tolist()} and {other.ends_m.tolist()}"
-                    )
+            if len(crossed := _crossed(ends[k], ends[:k])):
+                j = int(crossed[0])
+                raise UsageError(
+                    f"'{self._key(k)}' must not cross '{self._key(j)}': cut walls where they meet,"
+                    f" got {ends[k].tolist()} and {ends[j].tolist()}"
+                )
         return self
 
     def _key(self, k: int) -> str:
@@ -390,11 +391,11 @@ def _crossings(piece: _Float, others: _Float) -> tuple[_Float, _Float]:
     return np.where(parallel, np.nan, own), np.where(parallel, np.nan, theirs)
 
 
-def _cross(one: _Float, other: _Float) -> bool:
-    """Return whether two segments cross at a point that is no end of either."""
-    own, theirs = _crossings(one, other[None])
-    a, b = _TOUCH_M / np.hypot(*(one[2:] - one[:2])), _TOUCH_M / np.hypot(*(other[2:] - other[:2]))
-    return bool(a < own[0] < 1 - a and b < theirs[0] < 1 - b)
+def _crossed(one: _Float, others: _Float) -> NDArray[np.int64]:
+    """Return which segments another crosses at a point that is no end of either."""
+    own, theirs = _crossings(one, others)
+    a, b = (_TOUCH_M / np.hypot(*(ends[..., 2:] - ends[..., :2]).T) for ends in (one, others))
+    return np.flatnonzero((a < own) & (own < 1 - a) & (b < theirs) & (theirs < 1 - b))
 
 
 def cut_at_crossings(pieces: _Float) -> tuple[_Float, NDArray[np.int64]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -89,23 +90,25 @@ class SpaceModel(StopModel):
     Parameters
     ----------
     wall_map : WallMap
-    rows : int
-        Rows of zones of each sensor.
     """
 
     wall_map: WallMap
-    rows: int
     cameras: tuple[_Camera, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        scene, cameras, made = self.wall_map.scene(), [], dict[tuple[float, float, int, float], _Camera]()
-        steps = self.rig.row_steps_rad(), np.abs(self.numbers.step_rad)
-        for up, across, columns, footprint in zip(*steps, self.numbers.columns, self.numbers.footprint, strict=True):
-            key = float(up), float(across), int(columns), float(footprint)
+        scene, cameras, made = self.wall_map.scene(), [], dict[tuple[int, float, float, int, float], _Camera]()
+        across, numbers = np.abs(self.numbers.step_rad) * self._level, self.numbers
+        for (rows, up), *own in zip(self.rig.rows(), across, numbers.columns, numbers.footprint, strict=True):
+            key = rows, up, float(own[0]), int(own[1]), float(own[2])
             if key not in made:
-                made[key] = _Camera.of(scene, (self.rows, key[2]), key[:2], key[3])
+                made[key] = _Camera.of(scene, (rows, key[3]), (up, key[2]), key[4])
             cameras.append(made[key])
         object.__setattr__(self, "cameras", tuple(cameras))
+
+    @cached_property
+    def _level(self) -> _Float:
+        """How far along the level the rows that are reduced see for a depth of one, (S,)."""
+        return np.array([level.mean() for level in self.rig.levels()])
 
     @property
     def unknowns_std(self) -> _Float:
@@ -117,26 +120,27 @@ class SpaceModel(StopModel):
     def prediction(self, theta: _Float, scan: Scan, walls: bool = False) -> Prediction:
         """Return the depths that zones should show; a pose within a body shows none."""
         frames, sensors, zones = scan.depth_m.shape
-        shape = frames, sensors, self.rows, zones // self.rows
+        rows = max(rows for rows, _ in self.rig.rows())
+        shape = frames, sensors, rows, zones // rows
         depth, spread = np.full(shape, np.nan), np.zeros(shape)
         slope = np.zeros((*shape, N_ROWS + N_TILT))
         poses, motion = self._poses(theta, scan)
         place = np.r_[0:N_BODY, N_ROWS : N_ROWS + N_TILT, SENSOR_YAW]
         common = [*range(N_BODY), *range(N_BODY + 2 * sensors, len(theta))]
-        for s, (camera, one) in enumerate(zip(self.cameras, self.rig.sensor, strict=True)):
+        for s, camera in enumerate(self.cameras):
             views = np.concatenate([poses[:, s, None], poses[:, s, None] @ _NUDGES], axis=1)
             try:
                 mean, width = camera.zones(views.reshape(-1, 4, 4))
             except UsageError:  # the lens is inside a body
                 continue
             mean, width = (value.reshape(frames, len(_NUDGES) + 1, *value.shape[1:]) for value in (mean, width))
-            scale = self.numbers.scale[s] * math.cos(math.radians(one.pitch_deg))  # without what a level wall gains
-            count = mean.shape[3]
-            depth[:, s, :, :count] = scale * mean[:, 0] + self.numbers.offset_m[s] + theta[N_BODY + s]
-            spread[:, s, :, :count] = width[:, 0]
+            scale = self.numbers.scale[s] * self._level[s]  # without what a level wall gains
+            high, count = mean.shape[2:]
+            depth[:, s, :high, :count] = scale * mean[:, 0] + self.numbers.offset_m[s] + theta[N_BODY + s]
+            spread[:, s, :high, :count] = width[:, 0]
             by_motion = np.nan_to_num(scale / _STEP * (mean[:, 1:] - mean[:, :1]))
             by_unknown = motion[:, s][:, :, [*common, N_BODY + sensors + s]]
-            slope[:, s][:, :, :count, place] = np.einsum("fmrc,fmp->frcp", by_motion, by_unknown)
+            slope[:, s][:, :high, :count, place] = np.einsum("fmrc,fmp->frcp", by_motion, by_unknown)
         flat, no_walls = scan.depth_m.shape, np.empty((0, sensors, zones, 0))
         return Prediction(depth.reshape(flat), slope.reshape(*flat, -1), spread.reshape(flat), no_walls)
 
