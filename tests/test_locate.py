@@ -435,6 +435,17 @@ def test_a_sensor_that_is_stuck_is_left_out_and_odometry_that_jumps_refuses_the_
     assert answers[0].observed == np.isfinite(recording.depth_m[0, :, [0, 1, 3]]).sum()
 
 
+def test_numbers_of_stops_are_whole_and_names_of_sensors_their_own(tmp_path):
+    rig, file = ring_rig(2), tmp_path / "stops.npz"
+    arrays = {"z_m": np.ones((2, 1, 2, 8)), "frame_time_s": [0.0]}
+    np.savez(file, **arrays, stop=[0.1, 0.2])
+    with pytest.raises(InputFileError, match=r"stops.npz: 'stop' must be whole numbers, got 0\.1"):
+        read_rig_recording(file, rig)
+    np.savez(file, **{**arrays, "z_m": np.ones((2, 1, 3, 8))}, sensor=["s0", "s1", "s1"])
+    with pytest.raises(InputFileError, match="several sensors 's1' of the rig, got s0, s1, s1"):
+        read_rig_recording(file, rig)
+
+
 def test_a_sensor_that_repeats_itself_from_stop_to_stop_is_left_out(tmp_path):
     one, rig, path, recording = drive(np.random.default_rng(7), stops=6)
     recording.depth_m[2:, 0, 1] = recording.depth_m[1, 0, 1]

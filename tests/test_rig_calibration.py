@@ -1,6 +1,7 @@
 """A rig calibrated from stops with measured poses: simulated rigs are found again, within what is stated."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,9 @@ def test_poses_of_another_point_of_the_robot_and_a_silent_sensor_are_doubted():
     beside = poses + 0.1 * np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2]), np.zeros(15)])
     (doubt,) = calibrate_rig(rig, [recording], [one], [beside]).doubts
     assert doubt.startswith("poses of simulated, robot 0, are of a point")
+    ranges = recording.depth_m * np.hypot(1, np.tan((3.5 - np.arange(8)) * math.radians(45 / 8)))
+    (doubt,) = calibrate_rig(rig, [replace(recording, depth_m=ranges)], [one], [poses]).doubts
+    assert doubt.endswith("is 'quantity' of the rig right, and [noise]?")
     recording.depth_m[:, :, 1] = np.nan
     assert calibrate_rig(rig, [recording], [one], [poses]).doubts == ("s1 has no depths",)
 

@@ -129,7 +129,10 @@ def _located(
 ) -> list[LocatedPose]:
     """Locate the stops of a recording from what is known beforehand."""
     from phasemark.matcher.locate.recording import poses_of, read_stop_poses
+    from phasemark.matcher.locate.smoothing import odometry_of
 
+    if smooth:
+        odometry_of(recording)  # before the stops are located
     starts = None if start is None else poses_of(recording, read_stop_poses(start))
     if starts is not None and all(math.isnan(pose[0]) for pose in starts):
         raise InputFileError(f"{start}: has no pose of '{recording.run}', whose first stop is {recording.key(0)[1]}")

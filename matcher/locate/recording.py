@@ -177,7 +177,7 @@ def rig_recording(arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> R
     moved, odometry = _odometry(arrays, path, n, frames)
     robot_key = "drone" if "drone" in arrays else "robot"
     stop, robot = (
-        _number_array(arrays.get(key, default), path, key, (n,), True).astype(np.int64)
+        _whole(_number_array(arrays.get(key, default), path, key, (n,), True), path, key)
         for key, default in (("stop", np.arange(n)), (robot_key, np.zeros(n)))
     )
     run = str(arrays["run"]) if "run" in arrays else path.stem
@@ -214,6 +214,13 @@ def _number_array(
     return numbers
 
 
+def _whole(numbers: _Float, path: Path, name: str) -> NDArray[np.int64]:
+    """Return numbers of a file, refused unless they are whole."""
+    if len(broken := numbers[numbers != np.rint(numbers)]):
+        raise InputFileError(f"{path}: '{name}' must be whole numbers, got {broken[0]:g}")
+    return numbers.astype(np.int64)
+
+
 def _valid(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, rig: Rig) -> _Float:
     """Return depths with NaN where they are no measurement."""
     good = np.isfinite(depth) & (depth > 0)
@@ -233,8 +240,9 @@ def _of_sensors(depth: _Float, arrays: Mapping[str, NDArray[Any]], path: Path, r
     if len(names) != count:
         raise InputFileError(f"{path}: has {count} sensors, but {len(names)} names of sensors")
     for name in rig.names:
-        if name not in names:
-            raise InputFileError(f"{path}: no sensor '{name}' of the rig, got {', '.join(names)}")
+        if names.count(name) != 1:
+            found = "no sensor" if name not in names else "several sensors"
+            raise InputFileError(f"{path}: {found} '{name}' of the rig, got {', '.join(names)}")
     most = {"columns": rig.numbers().columns.max()}
     if depth.ndim == 5:
         most["rows"] = max(rows for rows, _ in rig.rows())

@@ -334,7 +334,7 @@ class _Problem:
                     f"poses of {self.recordings[r].run}, robot {robot}, are of a point {1e3 * math.hypot(x, y):.0f}"
                     f" mm from the robot's, {math.degrees(yaw):.1f}° off"
                 )
-        least_explained, growth = 0.7, 0.05  # a rig that was right has residuals that come and go by less
+        least_explained, growth, most_left = 0.7, 0.05, 1.2  # residuals of a right rig come and go by less
         for name, (explained, observed) in zip(self.rig.names, self.columns.T, strict=True):
             if not observed:
                 doubts.append(f"{name} has no depths")
@@ -343,6 +343,11 @@ class _Problem:
                 doubts.append(f"{share}, {100 * least_explained:.0f} % are needed")
         if last > first + growth:
             doubts.append(f"residuals grew from {first:.2f} to {last:.2f} standard deviations")
+        elif last > most_left:
+            doubts.append(
+                f"residuals of {last:.2f} standard deviations are left, {most_left:g} may be: is 'quantity' of the rig"
+                " right, and [noise]?"
+            )
         markers = tuple((self.recordings[r].run, robot, self.value[self.place[r, robot]]) for r, robot in self.groups)
         walls = [self.value[self.place["walls", m]] for m in range(len(self.maps)) if ("walls", m) in self.place]
         return RigCalibration(self.rig.with_numbers(self.numbers, of_rig), tuple(numbers), markers, tuple(walls),

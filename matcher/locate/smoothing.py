@@ -58,9 +58,7 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
     UsageError
         The recording has no odometry.
     """
-    odometry = recording.odometry
-    if odometry is None:
-        raise UsageError("smoothing needs odometry at the stops: odometry_x_m, odometry_y_m, odometry_yaw_rad")
+    odometry = odometry_of(recording)
     found, part, drift = list(answers), locator.wall_map.part, locator.rig.odometry
     for robot in np.unique(recording.robot):
         own = np.flatnonzero(recording.robot == robot)
@@ -83,6 +81,13 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
             found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found
+
+
+def odometry_of(recording: RigRecording) -> _Float:
+    """Return the odometry at the stops that smoothing needs, (n, 3); a UsageError if there is none."""
+    if recording.odometry is None:
+        raise UsageError("smoothing needs odometry at the stops: odometry_x_m, odometry_y_m, odometry_yaw_rad")
+    return recording.odometry
 
 
 def _is_measurement(answer: LocatedPose) -> bool:
