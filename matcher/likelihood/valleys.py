@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from phasemark.matcher.estimate.acceptance import is_acceptable
 from phasemark.matcher.estimate.fits import BETTER_COST, Fits, best_of_frame
@@ -77,8 +76,8 @@ def _followed(scene: Scene, evidence: Evidence, fits: Fits) -> tuple[Fits, NDArr
 class _Axes(NamedTuple):
     """Directions in which the likelihood about some solutions is followed, (k, a, P) each.
 
-    A step along the axis changes `held` by one, and those of all others leave it as it is; `along` changes all
-    parameters as the covariance has it, by one standard deviation, `alone` as few as can be.
+    The product of `held` and a step is how far it goes along the axis, in standard deviations. `along` goes one of them
+    with all parameters as the covariance has it, `alone` with as few as can be.
     """
 
     held: NDArray[np.float64]
@@ -139,12 +138,24 @@ def _along_valleys(
     followed = _Axes(*(one[row, a] for one in axes))
     moments = _valley(problem, state, known[row], followed)[:, :p, :p]
     for solution, held, moment in zip(known[row], followed.held[:, :p], moments, strict=True):
-        one = wide[solution]
-        share = one @ held
-        if held @ moment @ held > held @ share:  # what is left of the others where this is known, and the valley
-            variance, axis = linalg.eigh(moment - np.outer(share, share) / (held @ share), one)
-            wide[solution] = one + (one @ axis * np.maximum(variance, 0.0)) @ axis.T @ one
+        wide[solution] = _at_least(wide[solution], held, moment, problem.scale[:p])
     return wide, lower
+
+
+def _at_least(
+    one: NDArray[np.float64], held: NDArray[np.float64], moment: NDArray[np.float64], scale: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return a covariance that holds another one, and along a direction a valley's second moment, (p, p)."""
+    own = one @ held
+    if held @ moment @ held <= held @ own:
+        return one
+    value, vectors = np.linalg.eigh(one / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(value, 1e-12 * value.max()))
+    # what is left of the others where this direction is known, and the valley: more than before in some directions
+    more = np.linalg.solve(root, np.linalg.solve(root, moment - np.outer(own, own) / (held @ own)).T)
+    value, vectors = np.linalg.eigh(more)
+    axes = root @ vectors
+    return np.asarray(one + (axes * np.maximum(value, 0.0)) @ axes.T)
 
 
 def _rise_at(
