@@ -706,12 +706,17 @@ def test_zones_of_another_mode_or_damaged_odometry_are_no_frames_and_a_strange_s
 
 def test_lines_of_sensors_with_different_zones_are_one_frame(tmp_path):
     rig = Rig(sensor=[{"name": "fine"}, {"name": "coarse", "preset": "vl53l5cx-4x4"}])
-    rows = [{"sensor": name, "distances": [1000] * n, "t_ms": 1} for name, n in (("fine", 64), ("coarse", 16))]
+    rows: Any = [{"sensor": name, "distances": [1000] * n, "t_ms": 1} for name, n in (("fine", 64), ("coarse", 16))]
     file = tmp_path / "lines"
     file.write_text("".join(json.dumps(row) + "\n" for row in rows))
     source = RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig)
     frames: Any = [arrival.frames for arrival in source.frames()]
     assert source.n_damaged == 0
+    np.testing.assert_array_equal(frames[0].depth_m[0, 0], [[1.0] * 8, [1.0] * 4 + [np.nan] * 4])
+    rig = Rig(sensor=[{"name": "fine"}, {"name": "coarse", "rows": 1, "columns": 4}])
+    file.write_text("".join(json.dumps({**row, "distances": row["distances"][:n]}) + "\n"
+                            for row, n in zip(rows, (64, 4), strict=True)))  # fmt: skip
+    frames = [arrival.frames for arrival in RigLines(Stream("-", partial(open, file, "rb"), ends=True), rig).frames()]
     np.testing.assert_array_equal(frames[0].depth_m[0, 0], [[1.0] * 8, [1.0] * 4 + [np.nan] * 4])
 
 

@@ -5,6 +5,7 @@ import math
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -280,11 +281,13 @@ def test_a_drive_is_followed_from_its_odometry_and_smoothing_makes_it_no_worse()
     assert rms(joined)[2] < rms(answers)[2]
     assert (rms(joined) < 1.1 * rms(answers)).all()
     # an answer that is far off, but sure of itself, is left out by χ²
-    wrong, information = answers[5].evidence
-    answers[5] = replace(answers[5], evidence=(wrong + np.array([0.8, 0.0, 0.0]), information))
-    again = smoothed(recording, answers, locator)
-    assert not again[5].accepted
-    assert np.hypot(*(again[5].pose - path[5])[:2]) < 0.2
+    for k in (0, 5, 11):
+        wrong, information = answers[k].evidence
+        some = [*answers[:k], replace(answers[k], evidence=(wrong + np.array([0.8, 0.0, 0.0]), information))]
+        again = smoothed(recording, [*some, *answers[k + 1 :]], locator)
+        assert not again[k].accepted
+        assert sum(answer.accepted for answer in again) == 11
+    assert np.hypot(*(smoothed(recording, answers, locator)[5].pose - path[5])[:2]) < 0.2
 
 
 def test_wheels_that_slip_between_two_stops_leave_the_others_joined():
@@ -437,7 +440,7 @@ def test_a_sensor_that_is_stuck_is_left_out_and_odometry_that_jumps_refuses_the_
 
 def test_numbers_of_stops_are_whole_and_names_of_sensors_their_own(tmp_path):
     rig, file = ring_rig(2), tmp_path / "stops.npz"
-    arrays = {"z_m": np.ones((2, 1, 2, 8)), "frame_time_s": [0.0]}
+    arrays: Any = {"z_m": np.ones((2, 1, 2, 8)), "frame_time_s": [0.0]}
     np.savez(file, **arrays, stop=[0.1, 0.2])
     with pytest.raises(InputFileError, match=r"stops.npz: 'stop' must be whole numbers, got 0\.1"):
         read_rig_recording(file, rig)
@@ -456,9 +459,15 @@ def test_a_sensor_that_repeats_itself_from_stop_to_stop_is_left_out(tmp_path):
     answers = Locator(one, rig).locate(again, path, (0.2, 0.2, 0.2))
     assert sum(answer.accepted for answer in answers) >= 4
     assert all(np.hypot(*(answer.pose - true)[:2]) < 0.1 for answer, true in zip(answers, path, strict=True))
-    resting = replace(recording, odometry=np.tile(path[0], (6, 1)))  # a robot at rest sees the same again
+    around = path[0, 0], path[0, 1], math.pi - 1e-3  # a robot at rest sees the same again, and yaw may jump by a turn
+    resting = replace(recording, odometry=np.array([[*around[:2], around[2] * (-1) ** k] for k in range(6)]))
     file.write_bytes(recording_bytes(resting, rig))
     assert read_rig_recording(file, rig).notes == ("",) * 6
+    track = np.column_stack([np.zeros(8), np.zeros(8), 0.03 * np.arange(8)])
+    held = simulated_recording(one, rig, path[:1], np.random.default_rng(7), time_s=0.02 * np.arange(8), moved=track)
+    held.depth_m[0] = held.depth_m[0, [0, 0, 0, 0, 4, 4, 4, 4]]  # a log that is four times as fast as its sensors
+    file.write_bytes(recording_bytes(held, rig))
+    assert read_rig_recording(file, rig).notes == ("",)
 
 
 @pytest.mark.parametrize(
@@ -483,6 +492,17 @@ def test_rows_of_a_pitched_sensor_see_walls_at_their_own_depths(tmp_path, pitch_
         model = StopModel(rig, WallMap(walls_m=[end]).outline(), rig.numbers())
         seen = model.prediction(np.zeros(3 + len(model.unknowns_std)), recording.scan(0)).depth_m
         assert_allclose(recording.depth_m[0], seen, rtol=4e-3)  # rows of one column look a little aside of each other
+
+
+def test_a_calibrated_rig_of_pitched_sensors_has_the_numbers_it_was_given(tmp_path):
+    """Elevations of rows, and with them the depth of a wall, grow with the field of view."""
+    rig = Rig(sensor=[{"name": "one", "pitch_deg": 40}], reduction={"rows": (5, 7)})
+    numbers = rig.numbers()
+    numbers = numbers._replace(step_rad=1.05 * numbers.step_rad, scale=1.02 * numbers.scale)
+    (tmp_path / "rig.toml").write_text(rig.with_numbers(numbers, {}).to_toml())
+    again = read_rig(tmp_path / "rig.toml").numbers()
+    assert_allclose(again.step_rad, numbers.step_rad, rtol=1e-6)
+    assert_allclose(again.scale, numbers.scale, rtol=1e-6)
 
 
 def test_sensors_of_a_rig_may_have_different_rows(tmp_path):

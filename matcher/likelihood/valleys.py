@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from phasemark.matcher.estimate.acceptance import is_acceptable
 from phasemark.matcher.estimate.fits import BETTER_COST, Fits, best_of_frame
 from phasemark.matcher.information import covariance_of
+from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, Problem, State
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -54,8 +56,18 @@ def with_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
         again = refine(scene.final, evidence, starts, near_settings(scene, evidence))
         better = np.flatnonzero(again.cost < own.cost[falls] - BETTER_COST)
         if better.size:
-            own = own.with_rows(falls[better], _followed(scene, evidence, again[better])[0])
+            found = _followed(scene, evidence, again[better])[0]
+            own = own.with_rows(falls[better], _with_left(scene, found, own[falls[better]]))
     return fits.with_rows(best, own)
+
+
+def _with_left(scene: Scene, found: Fits, left: Fits) -> Fits:
+    """Return fits whose covariances hold the minima beside them that were left, by how likely these are."""
+    away = (left.view - found.view)[:, [VIEW.index(name) for name in scene.setup.free]]
+    share = special.expit(0.5 * (found.cost - left.cost))
+    wide = found.covariance + share[:, None, None] * away[:, :, None] * away[:, None, :]
+    growth = np.einsum("mpp->mp", wide) / np.einsum("mpp->mp", found.covariance)
+    return replace(found, covariance=wide, std_without_one=found.std_without_one * np.sqrt(growth))
 
 
 def _followed(scene: Scene, evidence: Evidence, fits: Fits) -> tuple[Fits, NDArray[np.float64]]:

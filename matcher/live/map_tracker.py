@@ -12,7 +12,13 @@ from numpy.typing import NDArray
 from phasemark.matcher.live.tracker import Located, step_between
 from phasemark.matcher.locate import Locator, RigRecording, simulated_recording
 from phasemark.matcher.locate.plane import relative_pose
-from phasemark.matcher.locate.recording import FEWEST_TO_STICK, has_moved, same_depths
+from phasemark.matcher.locate.recording import (
+    FEWEST_COLUMNS,
+    FEWEST_TO_STICK,
+    HELD_S,
+    has_moved,
+    same_depths,
+)
 from phasemark.matcher.sequence import Estimate
 
 
@@ -47,7 +53,7 @@ class MapTracker:
         """
         step_s, jumps, note = step_between(self._stamp_s, stamp_s)
         now = None if frames.odometry is None else frames.odometry[0]
-        frames, stuck = self._without_stuck(frames)
+        frames, stuck = self._without_stuck(frames, stamp_s)
         is_late = bool(self.locator.rig.numbers().delay_s.any())
         if is_late and step_s > 0 and not jumps and now is not None and self._odometry is not None:
             earlier = np.concatenate([[-step_s], relative_pose(now, self._odometry)])
@@ -74,17 +80,19 @@ class MapTracker:
             self._prior = self._prior[0], self._prior[1] + np.diag((self._rates * aged_s) ** 2)
         return Located(estimate, None, None, expected and found.accepted, note=note, aged_s=aged_s, stuck=tuple(stuck))
 
-    def _without_stuck(self, frames: RigRecording) -> tuple[RigRecording, list[str]]:
+    def _without_stuck(self, frames: RigRecording, stamp_s: float) -> tuple[RigRecording, list[str]]:
         """Return a frame without sensors that repeat what they measured before the odometry moved, and their names."""
         depth = frames.depth_m[0, -1]
         if frames.odometry is None:
             return frames, []
-        now = np.tile(frames.odometry[0], (len(depth), 1))
+        now = np.tile(np.append(frames.odometry[0], stamp_s), (len(depth), 1))
         before, times, begun = self._repeated or (np.full_like(depth, np.inf), np.zeros(len(depth), np.int64), now)
-        again = same_depths(depth, before) & np.isfinite(depth).any(axis=1)
+        again = same_depths(depth, before) & (np.isfinite(depth).sum(axis=1) >= FEWEST_COLUMNS)
         times, begun = np.where(again, times + 1, 1), np.where(again[:, None], begun, now)
         self._repeated = depth, times, begun
-        stuck = (times >= FEWEST_TO_STICK) & has_moved(np.abs(now - begun))
+        way = np.abs(now - begun)
+        way[:, 2] = np.minimum(way[:, 2], math.tau - way[:, 2])
+        stuck = (times >= FEWEST_TO_STICK) & has_moved(way) & (way[:, 3] > HELD_S)
         names = [name for name, one in zip(self.locator.rig.names, stuck, strict=True) if one]
         return (frames.without(np.broadcast_to(stuck, frames.depth_m.shape[:3])) if names else frames), names
 

@@ -110,6 +110,11 @@ class RigLines(StreamSource):
                 f"{self.name}: none of {self._n_frames} frames names the rig's sensor {', '.join(silent)}, they name"
                 f" {', '.join(self._heard)}"
             )
+        with_rows = next((row["z_m"].shape for row in held.values() if row["z_m"].ndim == 2), None)
+        for name, row in held.items():
+            if with_rows is not None and row["z_m"].ndim == 1 and self._zones[name][0] == 1:
+                row["z_m"] = np.pad(row["z_m"][None], ((0, with_rows[0] - 1), (0, 0)), constant_values=np.nan)
+                row["status"] = np.broadcast_to(row["status"], with_rows)
         if len({row["z_m"].shape for row in held.values()}) > 1:
             raise InputFileError(f"{self.name}: sensors of a frame have different numbers of zones")
         missing = {"z_m": np.full(last["z_m"].shape, np.nan), "status": last["status"]}

@@ -29,8 +29,10 @@ _FASTEST_M_S, _FASTEST_RAD_S = 5.0, 12.0
 """Odometry that moves faster between two frames has jumped."""
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
 """While a robot moves by more, no sensor returns the same depths at each frame."""
-FEWEST_TO_STICK = 3
-"""Frames that must agree to the last digit before a sensor counts as stuck."""
+FEWEST_TO_STICK, FEWEST_COLUMNS = 3, 3
+"""Frames that must agree to the last digit before a sensor counts as stuck, and columns: one may repeat by chance."""
+HELD_S = 0.25
+"""How long a fast log may hold the last depths of a slower sensor, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +334,7 @@ def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
 
 def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
     """Return which frames of which sensors, (n, F, S), repeat others though the odometry has moved."""
-    (n, frames, sensors), poses = recording.depth_m.shape[:3], recording.moved
+    (n, frames, sensors), poses, time_s = recording.depth_m.shape[:3], recording.moved, recording.time_s
     series, stuck = np.arange(n), np.zeros((n, frames, sensors), np.bool_)
     if recording.odometry is not None:  # else frames are compared within a stop alone
         series, (yaw, moved) = recording.robot, (recording.odometry[:, None, 2], recording.moved)
@@ -341,13 +343,16 @@ def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
     for one in np.unique(series):
         k, f = np.repeat(np.flatnonzero(series == one), frames), np.tile(np.arange(frames), (series == one).sum())
         for s in range(sensors):
-            seen = np.isfinite(recording.depth_m[k, f, s]).any(axis=1)
+            seen = np.isfinite(recording.depth_m[k, f, s]).sum(axis=1) >= FEWEST_COLUMNS
             own_k, own_f = k[seen], f[seen]
             depth = recording.depth_m[own_k, own_f, s]
             runs = np.cumsum(np.r_[False, ~same_depths(depth[1:], depth[:-1])])[: len(depth)]
             for run in np.flatnonzero(np.bincount(runs) >= FEWEST_TO_STICK):
-                where = own_k[runs == run], own_f[runs == run], s
-                stuck[where] = has_moved(np.ptp(poses[where[:2]], axis=0))
+                where = own_k[runs == run], own_f[runs == run]
+                lasts = len(set(where[0])) > 1 or np.ptp(time_s[where]) > HELD_S
+                way = poses[where]
+                way[:, 2] = np.unwrap(way[:, 2])
+                stuck[*where, s] = lasts and has_moved(np.ptp(way, axis=0))
     return stuck
 
 

@@ -25,7 +25,8 @@ _Positive = Annotated[float, Field(ge=1e-6, le=1e6)]
 _Size = Annotated[float, Field(ge=0, le=1e6)]
 
 
-_LEAST_LEVEL = 0.05
+_LEVEL_ROUNDS = 20
+_LEAST_LEVEL = 0.3
 """How far along the level a row must see, at least, for a depth of one."""
 
 
@@ -271,17 +272,21 @@ class Rig(PlanModel):
         std : mapping of str to (S,) float64
             By the names of :class:`SensorStd`, in its units.
         """
-        sensors, levels = [], self.levels()
+        sensors = []
         for k, one in enumerate(self.sensor):
+            columns, fov, level = int(numbers.columns[k]), one.fov_deg, 1.0
+            for _ in range(_LEVEL_ROUNDS):  # the elevations of rows grow with the field of view
+                level = float(self._level(one.model_copy(update={"fov_deg": fov, "columns": columns})).mean())
+                fov = math.degrees(abs(numbers.step_rad[k]) * level) * columns
             update: dict[str, Any] = {
                 "yaw_deg": math.degrees(numbers.yaw_rad[k]),
                 "x_m": float(numbers.x_m[k]),
                 "y_m": float(numbers.y_m[k]),
                 "delay_s": float(numbers.delay_s[k]),
                 "range_offset_m": float(numbers.offset_m[k]),
-                "range_scale": float(numbers.scale[k] * levels[k].mean()),
-                "fov_deg": math.degrees(abs(numbers.step_rad[k]) * levels[k].mean()) * int(numbers.columns[k]),
-                "columns": int(numbers.columns[k]),
+                "range_scale": float(numbers.scale[k]) * level,
+                "fov_deg": fov,
+                "columns": columns,
                 "std": one.std.model_copy(update={name: float(value[k]) for name, value in std.items()}),
             }
             sensors.append(one.model_copy(update=update))

@@ -27,6 +27,8 @@ _AS_WELL = 0.99
 """Share of the largest disagreement of a measurement with which a step is left out before it."""
 _OFTEN = 0.15
 """Share of the steps that do not hold from which the odometry is not believed."""
+_FEW = 2
+"""Measurements beyond a step that does not hold that may be wrong together."""
 _LEAST_KNOWN = 1e-6
 """Inverse squares of metres and radians: no stop is farther off than a kilometre, though a corridor does not say."""
 _MOST_STEPS = 10
@@ -78,6 +80,9 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         poses, covariance, used, chain = _Chain([found[k] for k in own], steps, drift).solved(used)
         if chain[-1] > _OFTEN * len(steps):  # only stops that were accepted alone speak for those near them
             used &= np.isin(chain, chain[used & alone])
+        # of two parts that contradict each other, a few stops are not believed beside many
+        count = np.bincount(chain, used)
+        used &= ((count > _FEW) | (count == count.max()))[chain]
         for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
             found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found

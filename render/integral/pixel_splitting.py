@@ -24,6 +24,10 @@ from phasemark.render.integral.strips import MAX_EVENTS, MAX_LINKS, MAX_SLABS, f
 from phasemark.render.kernel import inlined, inner
 
 _MAX_DEPTH = 5
+_MOST_TURNS = 3
+"""How often a box is cut for limbs that run along both of its sides."""
+_LEAST_LIMB, _ALONG, _FELT = 0.1, 3.0, 0.5
+"""These limbs are longer than this share of the side, in a proportion above this, and felt this many sides away."""
 
 
 class Scratch(NamedTuple):
@@ -180,12 +184,9 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
     else:
         sweep_v = crease_v >= crease_u
     curved = sideways or upright or has_limb
-    scratch.n_limbs[:] = 0
-    if curved:
-        # the pixel itself and its neighbours across the sweep may hold the limb this pixel's surface ends at
-        before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
-        for near in (head[i, j], before, after):
-            collect_limbs(near, edges, sweep_v, scratch)
+    _collect_about(i, j, curved, sweep_v, edges, scratch)
+    whole_v, collected_v = sweep_v, sweep_v
+    turned = curved and _directions(i, j, edges, c + 0.0, r + 0.0, c + 1.0, r + 1.0)[0]
     stack = scratch.boxes
     part, depth, trusted = 0, 0, True
     while depth > 0 or part < splits_u * splits_v:
@@ -197,7 +198,15 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
             part, depth = part + 1, 1
         depth -= 1
         bu0, bv0, bu1, bv1, level = stack[depth]
-        m = clip_to_box(head[i, j], edges, bu0, bv0, bu1, bv1, sweep_v, scratch)
+        crossed = False
+        if turned:  # limbs of several bodies run along u and along v: boxes with one direction each
+            crossed, along_u, along_v = _directions(i, j, edges, bu0, bv0, bu1, bv1)
+            crossed = crossed and level < _MOST_TURNS
+            sweep_v = whole_v if along_u == along_v else along_v > along_u
+            if not crossed and sweep_v != collected_v:
+                _collect_about(i, j, curved, sweep_v, edges, scratch)
+                collected_v = sweep_v
+        m = -1 if crossed else clip_to_box(head[i, j], edges, bu0, bv0, bu1, bv1, sweep_v, scratch)
         if sweep_v:
             box = Box(bv0, bv1, bu0, bu1, sweep_v, curved, bent, inverse_area)
         else:
@@ -224,6 +233,44 @@ def sample_pixel(r, c, bent, splits_u, splits_v, camera, edges, scratch, samples
 def _put_box(stack, k, u0, v0, u1, v1, level):  # type: ignore[no-untyped-def]
     """Write the k-th box still to be split, number by number: numba compiles a row that is set to a tuple at length."""
     stack[k, 0], stack[k, 1], stack[k, 2], stack[k, 3], stack[k, 4] = u0, v0, u1, v1, level
+
+
+@inner
+def _collect_about(i, j, curved, sweep_v, edges, scratch):  # type: ignore[no-untyped-def]
+    """Collect the limbs of a pixel and of its neighbours across the sweep, at which its surface may end."""
+    head = edges.head
+    scratch.n_limbs[:] = 0
+    if curved:
+        before, after = (head[i, j - 1], head[i, j + 1]) if sweep_v else (head[i - 1, j], head[i + 1, j])
+        for near in (head[i, j], before, after):
+            collect_limbs(near, edges, sweep_v, scratch)
+
+
+@inner
+def _directions(i, j, edges, u0, v0, u1, v1):  # type: ignore[no-untyped-def]
+    """Return whether limbs of different bodies run along u and along v in and about a box, and their longest extents.
+
+    The limb of one round body turns by itself, and its strips allow for that.
+    """
+    segments, head = edges.segments, edges.head
+    along_u, along_v, body_u, body_v = 0.0, 0.0, -1.0, -1.0
+    side_u, side_v = u1 - u0, v1 - v0
+    for near in (head[i, j], head[i, j - 1], head[i, j + 1], head[i - 1, j], head[i + 1, j]):
+        entry = near
+        while entry >= 0:
+            k = edges.owner[entry]
+            entry = edges.link[entry]
+            if edges.limb[k] != 1:
+                continue
+            ua, va, ub, vb = segments[k, 0], segments[k, 1], segments[k, 2], segments[k, 3]
+            more_u, more_v = _FELT * side_u, _FELT * side_v
+            lo, hi = clip(ua, va, ub, vb, u0 - more_u, v0 - more_v, u1 + more_u, v1 + more_v)
+            du, dv = max(hi - lo, 0.0) * abs(ub - ua), max(hi - lo, 0.0) * abs(vb - va)
+            if du > _ALONG * dv and du > max(along_u, _LEAST_LIMB * side_u):
+                along_u, body_u = du, edges.body[k]
+            elif dv > _ALONG * du and dv > max(along_v, _LEAST_LIMB * side_v):
+                along_v, body_v = dv, edges.body[k]
+    return along_u > 0.0 and along_v > 0.0 and body_u != body_v, along_u, along_v
 
 
 @inner
