@@ -90,8 +90,9 @@ class MapTracker:
         again = same_depths(depth, before) & (np.isfinite(depth).sum(axis=1) >= FEWEST_COLUMNS)
         times, begun = np.where(again, times + 1, 1), np.where(again[:, None], begun, now)
         self._repeated = depth, times, begun
-        way = np.abs(now - begun)
-        way[:, 2] = np.minimum(way[:, 2], math.tau - way[:, 2])
+        way = now - begun
+        way[:, 2] = np.remainder(way[:, 2] + math.pi, math.tau) - math.pi
+        way = np.abs(way)
         stuck = (times >= FEWEST_TO_STICK) & has_moved(way) & (way[:, 3] > HELD_S)
         names = [name for name, one in zip(self.locator.rig.names, stuck, strict=True) if one]
         return (frames.without(np.broadcast_to(stuck, frames.depth_m.shape[:3])) if names else frames), names

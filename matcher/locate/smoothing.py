@@ -39,8 +39,9 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
 
     What the frames of accepted stops speak for are measurements, and of undetermined ones that no other pose explains
     and that do tell each of x, y and yaw. What disagrees most with the rest by χ² is left out, a measurement or a step
-    of the odometry: wheels slip. A stop that was ambiguous or explained poorly is located again with the poses around
-    as its prior. An answer is accepted if its stop takes part and its pose is determined then.
+    of the odometry: wheels slip. Of two parts of the way that it does not join, one of a stop or two is not believed
+    beside a longer one. A stop that was ambiguous or explained poorly is located again with the poses around as its
+    prior. An answer is accepted if its stop takes part and its pose is determined then.
 
     Parameters
     ----------
