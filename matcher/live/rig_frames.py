@@ -41,6 +41,7 @@ class RigLines(StreamSource):
     def __init__(self, stream: Stream, rig: Rig) -> None:
         super().__init__(stream)
         self._rig, self._heard, self._n_frames = rig, set[str](), 0
+        self._unknown = set[str]()
         rows = [rows for rows, _ in rig.rows()]
         self._zones = dict(zip(rig.names, zip(rows, rig.numbers().columns.tolist(), strict=True), strict=True))
 
@@ -81,8 +82,12 @@ class RigLines(StreamSource):
             raise InputFileError(f"{self.name}: {printed.damage}")
         given = json.loads(text)
         name, odometry = given.get("sensor"), given.get("odometry")
-        if name not in self._zones:
-            raise UsageError(f"{self.name}: frames name the sensor {name!r}, the rig has {', '.join(self._rig.names)}")
+        if not isinstance(name, str) or name not in self._zones:
+            wrong = f"{self.name}: frames name the sensor {name!r}, the rig has {', '.join(self._rig.names)}"
+            if repr(name) in self._unknown:
+                raise UsageError(wrong)
+            self._unknown.add(repr(name))  # once, a line is garbled
+            raise InputFileError(wrong)
         n, (rows, columns) = len(printed.distance_mm), self._zones[name]
         if n not in (columns, rows * columns):
             raise InputFileError(f"{self.name}: {n} zones, the sensor has {rows} × {columns}")
@@ -104,6 +109,8 @@ class RigLines(StreamSource):
         """Return lines of several sensors as one frame, invalid where a sensor sent nothing."""
         names, last = self._rig.names, list(held.values())[-1]
         self._heard |= held.keys()
+        if len(held) == len(names):
+            self._unknown.clear()
         self._n_frames += 1
         if self._n_frames >= _SILENT_FRAMES and (silent := [name for name in names if name not in self._heard]):
             raise UsageError(
