@@ -11,7 +11,16 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.matcher import Match
 from phasemark.matcher.match import Candidate
-from phasemark.matcher.sequence import FreeMotion, PoseEstimator, PoseFilter, Reading, Sighting, Standing
+from phasemark.matcher.sequence import (
+    FreeMotion,
+    OdometryPlan,
+    PoseEstimator,
+    PoseFilter,
+    Reading,
+    Sighting,
+    Standing,
+)
+from phasemark.matcher.sequence.odometry import motion_noise, moved
 from phasemark.matcher.statistics import nees
 
 FREE = ("distance_m", "delta_rad", "bearing_rad")
@@ -94,6 +103,36 @@ def test_poses_of_simulated_drives_are_as_uncertain_as_stated():
     low, high = stats.chi2.ppf([0.0005, 0.9995], 3 * n)
     assert low < nees(np.array(errors), np.array(covariances)).sum() < high
     assert accepted > 0.9 * n
+
+
+@pytest.mark.parametrize(("shared_std", "delay_std_s"), [(np.sqrt(np.diag(SHARED)), 0.0), (np.zeros(3), 0.02)])
+def test_errors_that_last_are_not_learnt_from_noise_nor_a_moving_robot_s_delay_forgotten(shared_std, delay_std_s):
+    """The first pose and the last, 60 frames on, of drives past a landmark with odometry, to and fro."""
+    rng, plan, n, time_s = np.random.default_rng(3), OdometryPlan(), 100, 0.1
+    noise = np.diag(np.square([0.003, math.radians(1.0), math.radians(0.2)]))
+    errors, covariances = np.zeros((2, n, 3)), np.zeros((2, n, 3, 3))
+    for drive in range(n):
+        lasting, late_s = shared_std * rng.standard_normal(3), delay_std_s * rng.standard_normal()
+        state = np.array(
+            [-1.8, -0.6, 0.3, *np.sqrt(np.diag(plan.start(np.zeros((3, 3))))[3:]) * rng.standard_normal(2)]
+        )
+        estimator = PoseEstimator(Standing(), plan, delay_std_s=delay_std_s)
+        for k in range(60):
+            reading = Reading(0.03, 0.15 * math.cos(k / 6), time_s)
+            before = state
+            state = rng.multivariate_normal(moved(state, reading), motion_noise(state, reading, plan))
+            pose = state[:3] + (state - before)[:3] / time_s * late_s
+            view = estimator.standing.view(pose) + lasting + rng.multivariate_normal(np.zeros(3), noise)
+            estimator.move(reading)
+            found = estimator.see(match_of(view, noise, shared=np.diag(shared_std**2)))
+            if k in (0, 59):
+                assert found.pose is not None
+                apart = found.pose - state[:3]
+                errors[k // 59, drive] = *apart[:2], math.remainder(apart[2], math.tau)
+                covariances[k // 59, drive] = found.covariance
+    low, high = stats.chi2.ppf([0.0005, 0.9995], 3 * n)
+    for own, stated in zip(errors, covariances, strict=True):
+        assert low < nees(own, stated).sum() < high
 
 
 def test_smoothed_poses_of_a_drive_are_nearer_to_the_truth_than_filtered_ones():

@@ -147,7 +147,7 @@ class PoseEstimator:
         self._motion, self._gate, self._lost_after_s = motion, gate, lost_after_s
         self._tolerance, self._jitter_s, self._delay_std_s = (tolerance_m, tolerance_rad), jitter_s, delay_std_s
         self._tracks: list[_Track] = []
-        self._smooths = smooths
+        self._smooths, self._last = smooths, Reading(0.0, 0.0, 1.0)
 
     @property
     def filter(self) -> PoseFilter | None:
@@ -164,6 +164,7 @@ class PoseEstimator:
 
     def move(self, reading: Reading) -> None:
         """Take one step of the odometry, or let time pass."""
+        self._last = reading if reading.time_s > 0 else self._last
         for track in self._tracks:
             track.filter.predict(reading)
             track.unseen_s += reading.time_s
@@ -206,17 +207,26 @@ class PoseEstimator:
         return found
 
     def _timed(self, match: Match, expected: PoseFilter | None) -> list[Sighting]:
-        """Return the poses that a match allows, with what errors of its stamp make of the motion."""
-        rate = np.zeros(POSE) if expected is None else expected.rate
-        late = self._jitter_s * rate
-        return [
-            replace(
-                one,
-                covariance=one.covariance + np.outer(late, late),
-                loading=np.column_stack([one.loading, self._delay_std_s * rate]),
-            )
-            for one in self.standing.sightings(match, None if expected is None else expected.pose)
-        ]
+        """Return the poses that a match allows, with what errors of its stamp make of the motion.
+
+        Errors that frames share are linear about the pose by this frame and all before it: about that of each frame
+        alone, noise would make them seem to differ, and the filter would learn from that what they are.
+        """
+        timed = []
+        for one in self.standing.sightings(match, None if expected is None else expected.pose):
+            moving = expected
+            if moving is None:
+                moving = PoseFilter(one.pose, one.covariance, self._motion, self._gate)
+                moving.predict(self._last)
+            late, unknown = self._jitter_s * moving.rate, self._jitter_s**2 + self._delay_std_s**2
+            noise = one.covariance + np.outer(late, late) + unknown * moving.rate_covariance
+            loading = np.column_stack([one.loading, self._delay_std_s * moving.rate])
+            timed.append(replace(one, covariance=noise, loading=loading))
+            if expected is not None:
+                corrected = expected.copy()
+                corrected.take(timed[-1])
+                loading[:, :POSE] = self.standing.loading(match, corrected.pose)
+        return timed
 
     def _born(self, sighting: Sighting) -> PoseFilter:
         """Return a filter that knows a measured pose alone."""

@@ -117,7 +117,8 @@ class PoseFilter:
         self._steps: _Step | None = None
         self._jacobian, self._predicted = np.eye(n), (self.state, self.covariance)
         self.rate: _Floats = np.zeros(POSE)
-        """How fast the pose changed in the last prediction, per second."""
+        self.rate_covariance: _Floats = np.zeros((POSE, POSE))
+        """How fast the pose changed in the last prediction, per second, and how well that is known."""
 
     @property
     def pose(self) -> _Floats:
@@ -140,11 +141,12 @@ class PoseFilter:
         m = self._moving
         jacobian, noise = np.eye(len(self.state)), np.zeros_like(self.covariance)
         after, jacobian[:m, :m], noise[:m, :m] = self._model.step(self.state[:m], reading)
-        self.covariance = jacobian @ self.covariance @ jacobian.T + noise
         change = after[:POSE] - self.pose
         change[2] = math.remainder(change[2], math.tau)
         if reading.time_s > 0:
-            self.rate = change / reading.time_s
+            by_state = (jacobian - np.eye(len(jacobian)))[:POSE] / reading.time_s
+            self.rate, self.rate_covariance = change / reading.time_s, by_state @ self.covariance @ by_state.T
+        self.covariance = jacobian @ self.covariance @ jacobian.T + noise
         self.state = np.concatenate([after, self.state[m:]])
         self._jacobian, self._predicted = jacobian @ self._jacobian, (self.state, self.covariance)
 

@@ -87,7 +87,7 @@ class Standing:
                 one = replace(one, delta_rad=expected_rad + turn, symmetry=1)
             for pose in self._poses(one):
                 at = np.array([pose.x_m, pose.y_m, pose.heading_rad])
-                found.append(self._sighting(one, pose, at, math.log(share / one.symmetry)))
+                found.append(self._sighting(one, pose, at, at, math.log(share / one.symmetry)))
         return found
 
     def _about(self, match: Match, about: NDArray[np.float64]) -> Sighting:
@@ -98,8 +98,7 @@ class Standing:
         change[2] = math.remainder(change[2], math.tau)
         there = replace(match, distance_m=view[0], delta_rad=view[1], bearing_rad=view[2], symmetry=1)
         (pose,) = self._poses(there)
-        at = about + self._jacobian(there, pose) @ change
-        return self._sighting(there, pose, at, 0.0)
+        return self._sighting(there, pose, about + self._jacobian(about) @ change, about, 0.0)
 
     def _poses(self, match: Match) -> list[RobotPose]:
         """Return the poses of the robot with the covariance of the noise alone."""
@@ -114,18 +113,31 @@ class Standing:
             lens_offset_xy_m=self.lens_offset_xy_m,
         )
 
-    def _jacobian(self, match: Match, pose: RobotPose) -> NDArray[np.float64]:
-        """Return ∂ pose / ∂ (D, δ, b), (3, 3)."""
-        towards = rotation(pose.camera_heading_rad + match.bearing_rad)[:, 0]
-        to_pan = rotation(pose.heading_rad) @ self.pan_offset_xy_m
-        to_lens = rotation(pose.camera_heading_rad) @ self.lens_offset_xy_m
-        whole = pose_jacobian(
-            match.distance_m, towards, pose.heading_rad, pose.camera_heading_rad, to_pan, to_lens
-        )  # fmt: skip
-        return whole[:, :3]
+    def _jacobian(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return ∂ pose / ∂ (D, δ, b) at a pose, (3, 3)."""
+        distance_m, _, bearing_rad = self.view(pose)
+        camera_rad = float(pose[2]) + self.pan_rad
+        towards = rotation(camera_rad + bearing_rad)[:, 0]
+        to_pan, to_lens = rotation(pose[2]) @ self.pan_offset_xy_m, rotation(camera_rad) @ self.lens_offset_xy_m
+        return pose_jacobian(distance_m, towards, float(pose[2]), camera_rad, to_pan, to_lens)[:, :3]
 
-    def _sighting(self, match: Match, pose: RobotPose, at: NDArray[np.float64], log_share: float) -> Sighting:
+    def _sighting(
+        self, match: Match, pose: RobotPose, at: NDArray[np.float64], linear_at: NDArray[np.float64], log_share: float
+    ) -> Sighting:
         assert pose.covariance is not None
+        noise = pose.covariance + _LEAST_VARIANCE * np.eye(3)
+        return Sighting(at, noise, self.loading(match, linear_at), self.rows, log_share)
+
+    def loading(self, match: Match, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by what errors that all frames share move a pose, per standard deviation of each, (3, 3).
+
+        Parameters
+        ----------
+        match : Match
+            With a covariance.
+        pose : (3,) float64
+            Where they are linear.
+        """
         shared = np.zeros((3, 3))
         places = [(k, _VIEW.index(name)) for k, name in enumerate(match.free) if name in _VIEW]
         own, into = np.array(places).T
@@ -134,9 +146,7 @@ class Standing:
                 shared[np.ix_(into, into)] += match.systematic[name][np.ix_(own, own)]
         values, vectors = np.linalg.eigh(shared)
         # the symmetric root changes with the view as little as the covariance does
-        root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-        noise = pose.covariance + _LEAST_VARIANCE * np.eye(3)
-        return Sighting(at, noise, self._jacobian(match, pose) @ root, self.rows, log_share)
+        return self._jacobian(pose) @ ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
 
 
 def is_open(match: Match) -> bool:
