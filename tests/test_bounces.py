@@ -288,6 +288,17 @@ def test_a_lamp_that_fades_dims_direct_light_and_even_light_is_that_of_no_lamp()
     assert np.allclose(sampled.intensity, fading.intensity, rtol=3e-4)  # linear between degrees
 
 
+def test_light_of_a_pose_does_not_depend_on_others_that_look_away_and_black_bodies_return_none() -> None:
+    bodies, sensor = _corner()
+    away = np.diag([-1.0, -1.0, 1.0, 1.0])
+    alone = SceneRenderer(Scene(bodies), sensor, bounces=1, bounce_tolerance=1e-2).phasors(np.eye(4)).phasor[0]
+    both = SceneRenderer(Scene(bodies), sensor, bounces=1, bounce_tolerance=1e-2).phasors([away, np.eye(4)]).phasor
+    assert not both[0].any()
+    assert np.abs(both[1] - alone).max() < 1e-2 * np.abs(alone).max()
+    black = Scene([replace(body, albedo=0.0) for body in bodies])
+    assert not SceneRenderer(black, sensor, bounces=1, bounce_tolerance=1e-2).phasors(np.eye(4)).phasor.any()
+
+
 def test_bounces_that_cannot_be_computed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     bodies, sensor = _corner()
     scene = Scene(bodies)

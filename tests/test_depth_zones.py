@@ -194,6 +194,13 @@ def test_pixels_that_a_border_cuts_count_in_part():
     np.testing.assert_allclose(narrow.images.coverage[0], np.tile(share, (8, 1)), atol=1e-12)
 
 
+def test_gaps_between_active_areas_that_are_narrower_than_parts_of_pixels_give_no_light():
+    sensor = preset("pmd-16x16").with_(fill_factor=(0.99, 0.995))
+    wall, at = np.ones((256, 256)), intrinsics(256, np.tan(np.radians(20)))
+    level, rolled = (zones_from_depth(wall, at, sensor, depth2camera=turned((0, 0, a))).images for a in (0.0, 5.0))
+    np.testing.assert_allclose(rolled.intensity, level.intensity, rtol=2e-4)
+
+
 @pytest.mark.parametrize("lens", [(-0.25, 0.06, 0.001, -0.002), ()], ids=["distortion", "ideal"])
 def test_zones_of_a_wall_are_those_of_the_renderer(lens):
     matrix = np.array([[9.0, 0.0, 3.4], [0.0, 9.2, 3.6], [0.0, 0.0, 1.0]])
@@ -246,7 +253,7 @@ def test_a_batch_is_its_images_and_can_be_captured():
 
 def test_nothing_returns_from_pixels_without_depth_and_from_beyond_the_image():
     depth = np.full((16, 16), np.inf)
-    depth[:8], depth[12:] = np.nan, -1.0
+    depth[:8], depth[12:], depth[8, :3] = np.nan, -1.0, [1e-300, 1e-200, 1e300]
     zones = zones_from_depth(depth, intrinsics(16), ZONES)
     assert not zones.images.intensity.any()
     assert zones.discretisation_error[0] == 0

@@ -209,13 +209,6 @@ class BouncedLight:
         offset = where[kept] - self.patches.centre[patch[kept]]
         return _Seen(pixels_of(samples, self.sensor)[kept], patch[kept], offset, samples.range_m[kept], weight[kept])
 
-    @property
-    def brightest(self) -> float:
-        """Intensity of the brightest pixel in direct light, first pose."""
-        samples = self._mesh.samples_of_poses(of_poses(self.poses, slice(0, 1)), self._grid, 1.0, 1.0)
-        light = samples.amplitude * (self._grid.scale_u * self._grid.scale_v)
-        return float(np.bincount(pixels_of(samples, self.sensor), light).max())
-
     def _gathered(
         self, seen: list[_Seen], light: NDArray[np.complex128], wave_number: float, free: NDArray[np.bool_] | None
     ) -> NDArray[np.complex128]:
@@ -254,8 +247,8 @@ def refined(
     topology, intersector, sensor, poses, kind
         As :class:`BouncedLight` has them.
     tolerance : float
-        Root mean square over the pixels of the first pose of the change at the highest frequency when the patches
-        shrink by √2, as a share of the brightest pixel's direct light.
+        Root mean square over the pixels of the first pose that sees light of the change at the highest frequency when
+        the patches shrink by √2, as a share of the brightest pixel's direct light.
 
     Raises
     ------
@@ -263,11 +256,16 @@ def refined(
         As for :class:`BouncedLight`, or the finest patches do not meet the tolerance.
     """
     before, size, change = None, _COARSEST, np.inf
+    mesh, brightest = SceneMesh.of_surface(topology, intersector, int(topology.part.max()) + 1), 0.0
+    for k in range(len(poses.lens)):
+        judged = of_poses(poses, slice(k, k + 1))
+        if (brightest := _brightest(mesh, sensor, judged)) > 0:
+            break
     while size > _LAST:
-        found = BouncedLight(topology, intersector, sensor, of_poses(poses, slice(0, 1)), size, kind)
+        found = BouncedLight(topology, intersector, sensor, judged, size, kind)
         light = found.phasors([max(sensor.frequencies_hz)], _ENOUGH, tolerance)[0, :, 0, 0]
         if before is not None:
-            change = float(np.sqrt(np.mean(np.abs(light - before) ** 2))) / found.brightest
+            change = float(np.sqrt(np.mean(np.abs(light - before) ** 2))) / (brightest or 1.0)
         if change <= tolerance:
             return found if len(poses.lens) == 1 else BouncedLight(topology, intersector, sensor, poses, size, kind)
         before, size = light, _FINER * size
@@ -275,6 +273,14 @@ def refined(
         f"light that bounces changes by {change:.1g} of the brightest pixel between {len(found.patches)} patches and"
         f" half as many: 'bounce_tolerance' must be at least that, got {tolerance:g}"
     )
+
+
+def _brightest(mesh: SceneMesh, sensor: Sensor, pose: Poses) -> float:
+    """Return the intensity of the brightest pixel in direct light."""
+    grid = camera_of(sensor, (0, sensor.rows), ())
+    samples = mesh.samples_of_poses(pose, grid, 1.0, 1.0)
+    light = samples.amplitude * (grid.scale_u * grid.scale_v)
+    return float(np.bincount(pixels_of(samples, sensor), light, 1).max())
 
 
 def check_bounces(bounces: Bounces, tolerance: float, sensor: Sensor) -> None:

@@ -31,7 +31,8 @@ def sizes_for_light(wanted_at: SizeAt, coarse: Patches, light: NDArray[np.float6
     Light counts twice, for what a patch sends on and for what of it returns; sizes go with its fourth root inverted.
     Near another surface a patch is half as large as the gap, or `finest` as a share of its size elsewhere.
     """
-    darkness = np.clip(light / (_BRIGHT * light.max()), _DIMMEST / _BRIGHT, 1.0) ** -0.25
+    brightest = light.max(initial=0.0) or 1.0  # in darkness all are coarse
+    darkness = np.clip(light / (_BRIGHT * brightest), _DIMMEST / _BRIGHT, 1.0) ** -0.25
     reach = float(np.ptp(coarse.centre, axis=0).max())  # normals count as much as places
     tree = cKDTree(np.concatenate([coarse.centre, reach * coarse.normal], axis=1))
 

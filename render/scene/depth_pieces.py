@@ -148,12 +148,16 @@ def _bent(
 def _sides(
     corners: NDArray[np.float64], cuts: NDArray[np.float64]
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Return the middle and the share of what lies before the first cut through each cell, and of what lies behind."""
+    """Return the middle and the share of what lies between the cuts through each cell, in their order."""
     four = _four(corners)
     low, high = four.min(axis=0).ravel(), four.max(axis=0).ravel()
-    cut = np.clip(np.append(cuts, np.inf)[np.searchsorted(cuts, low)], low, high)
-    before = (cut - low) / np.maximum(high - low, np.finfo(float).tiny)
-    return [(0.5 * (low + cut), before), (0.5 * (cut + high), 1 - before)]
+    first, behind = np.searchsorted(cuts, low), np.searchsorted(cuts, high)
+    found, begin = [], low
+    for k in range(int((behind - first).max(initial=0)) + 1):
+        end = np.clip(np.append(cuts, np.inf)[np.minimum(first + k, len(cuts))], low, high)
+        found.append((0.5 * (begin + end), (end - begin) / np.maximum(high - low, np.finfo(float).tiny)))
+        begin = end
+    return found
 
 
 def _four(values: NDArray[Any]) -> NDArray[Any]:

@@ -28,6 +28,7 @@ from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor
 
 _ALBEDO = 0.8
+_NEAREST_M, _FARTHEST_M = 1e-4, 1e6  # no surface is nearer or farther
 _FEWEST = 8  # pixels a side of a depth image
 _COARSE = 2  # pixels of the images of less resolution that the error is estimated from
 
@@ -74,7 +75,7 @@ def zones_from_depth(
     Parameters
     ----------
     depth_m : (H, W) or (n, H, W) array_like
-        Metres, floating point. 0, negative, NaN and infinite: nothing returns.
+        Metres, floating point. 0, negative, NaN, infinite, below 0.1 mm and above 1000 km: nothing returns.
     intrinsics : (fx, fy, cx, cy) or (3, 3) array_like
         Of the depth image, pixels, as OpenCV has them: the centre of the first pixel is (0, 0). An image of W columns
         and a horizontal field of view φ has fx = W / (2 tan(φ/2)) and, with the axis in the middle, cx = (W − 1) / 2.
@@ -232,10 +233,8 @@ def _see(
     normals: NDArray[np.float64] | None,
 ) -> _Seen:
     """Add up what the zones see of one depth image."""
-    returns = np.isfinite(depth) & (depth > 0)
-    z = np.where(returns, depth, np.nan)
-    if quantity == "range":
-        z = z / plan.length
+    returns = np.isfinite(depth)
+    z = depth / plan.length if quantity == "range" else depth
     inverse = 1 / z
     range_m = np.where(returns, z * plan.length, 0.0)
     amplitudes = [np.empty(depth.shape), np.empty(depth.shape)]
@@ -343,7 +342,7 @@ def _depth_images(depth_m: ArrayLike) -> NDArray[np.float64]:
     farthest_m = 100.0  # most of an image farther away is beyond every sensor of zones
     if returns.size and (middle := float(np.median(returns))) > farthest_m:
         raise UsageError(f"'depth_m' must be metres, and its median is {middle:.4g}: divide millimetres by 1000")
-    return images
+    return np.where((images >= _NEAREST_M) & (images <= _FARTHEST_M), images, np.nan)
 
 
 def _camera_numbers(intrinsics: ArrayLike) -> tuple[float, float, float, float]:
