@@ -24,8 +24,9 @@ _EVEN = 1 + 1e-6
 """Rounding of areas that are the same."""
 _DEEP = 0.2
 """Largest extent of a patch across its first facet, in sizes of the patch: surfaces in two planes are not joined."""
-_LIFT = 1e-5
-"""Share of the scene's extent by which rays begin above their surface, as they are of single precision."""
+_LIFT, _WIDEST_M = 1e-5, 20.0
+"""Share of the scene's extent by which rays begin above their surface, as they are of single precision; and the extent
+from which on that no longer grows: facets are small where light is, however far a floor reaches."""
 _NEAREST = 0.1
 """Least distance from a lens that points resolve, in sizes of a patch."""
 SizeAt = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
@@ -199,13 +200,12 @@ def make_patches(
     before_others : int, optional
         A body to whose outer sides surfaces that are not of the scene send light, as a wall somewhere behind it.
     """
-    lift = _lift_of(topology)
-    normals = topology.planes[:, :3]
+    lift, normals = _lift_of(topology), topology.planes[:, :3]
     triangles, face = cut_where_bodies_stand(
         topology.vertices[topology.faces], np.arange(len(topology.faces)), topology, lift
     )
     triangles, face, sizes = _cut(triangles, face, lambda at, own: size_at(at, normals[own]))
-    solid = _Solid(topology, intersector, lift)
+    solid = _Solid(topology, intersector, _LIFT * _extent(topology))  # whose faces are large
     buried = solid.buries(triangles, face)
     edges = triangles[:, 1:] - triangles[:, :1]
     areas = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
@@ -225,7 +225,11 @@ def light_bounces(topology: MeshTopology) -> bool:
 
 
 def _lift_of(topology: MeshTopology) -> float:
-    return _LIFT * float((topology.high - topology.low).max())
+    return _LIFT * min(_extent(topology), _WIDEST_M)
+
+
+def _extent(topology: MeshTopology) -> float:
+    return float((topology.high - topology.low).max())
 
 
 def _longest(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
