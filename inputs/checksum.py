@@ -11,7 +11,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import BinaryIO
 
-from phasemark import InputFileError
+from phasemark import InputFileError, PhasemarkError
 
 _BLOCK_BYTES = 1 << 20
 _MOST_BYTES = 1 << 14
@@ -35,6 +35,18 @@ def checksum_path(path: str | os.PathLike[str]) -> Path:
     """
     path = Path(path)
     return path.with_name(path.name + ".sha256")
+
+
+@contextmanager
+def read_errors(path: Path) -> Iterator[None]:
+    """Turn an error of opening or reading a file in the block into one line."""
+    try:
+        yield
+    except PhasemarkError:
+        raise
+    except (OSError, ValueError) as error:  # the second: a NUL in the name
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputFileError(f"{path}: cannot be read ({reason})") from None
 
 
 def sha256_of(source: str | os.PathLike[str] | BinaryIO) -> str:
@@ -78,11 +90,8 @@ def read_checksum(path: str | os.PathLike[str]) -> str:
     """
     path = _with_checksum(Path(path))
     beside = checksum_path(path)
-    try:
-        with beside.open("rb") as file:
-            text = os.fsdecode(file.read(_MOST_BYTES))
-    except OSError as error:
-        raise InputFileError(f"{beside}: cannot be read ({error.strerror})") from None
+    with read_errors(beside), beside.open("rb") as file:
+        text = os.fsdecode(file.read(_MOST_BYTES))
     match = _CHECKSUM_LINE.fullmatch(text)
     if match is None:
         raise InputFileError(f"{beside}: must be one line '<SHA-256>  {path.name}', as sha256sum writes it")
@@ -201,14 +210,12 @@ def _with_checksum(path: Path) -> Path:
 def _digest(path: Path, content: bytes | BinaryIO | None) -> str:
     if isinstance(content, bytes):
         return hashlib.sha256(content).hexdigest()
-    try:
+    with read_errors(path):
         if content is None:
             return sha256_of(path)
         content.seek(0)
         digest = sha256_of(content)
         content.seek(0)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
     return digest
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
-from phasemark.inputs.checksum import is_vouched_for
+from phasemark.inputs.checksum import is_vouched_for, read_errors
 
 MOST_TOML_BYTES = 1 << 22
 """Largest size of a plan, a map or a sensor file, bytes."""
@@ -59,13 +59,11 @@ def opened(path: Path, *, most_bytes: int) -> Iterator[BinaryIO]:
     InputFileError
         The file cannot be opened, is not what its checksum says, or delivers too much.
     """
-    try:
+    with read_errors(path):
         if not stat.S_ISREG(path.stat().st_mode):
             plain: BinaryIO = io.BytesIO(_content(path, most_bytes))
         else:
             plain = path.open("rb")
-    except (OSError, ValueError) as error:  # the second: a NUL in the name
-        raise _unreadable(path, error) from None
     with plain:
         if not isinstance(plain, io.BytesIO):
             is_vouched_for(path, plain)
@@ -88,10 +86,8 @@ def read_whole(path: str | os.PathLike[str], *, most_bytes: int) -> bytes:
         The file cannot be read, is larger, or is not what its checksum says.
     """
     path = Path(path)
-    try:
+    with read_errors(path):
         content = _content(path, most_bytes)
-    except (OSError, ValueError) as error:  # the second: a NUL in the name
-        raise _unreadable(path, error) from None
     is_vouched_for(path, content)
     return content
 
@@ -138,11 +134,6 @@ def read_text(path: str | os.PathLike[str], *, most_bytes: int) -> str:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputFileError(f"{path}: is no text file (byte {error.start} is not UTF-8)") from None
-
-
-def _unreadable(path: Path, error: OSError | ValueError) -> InputFileError:
-    reason = error.strerror if isinstance(error, OSError) else error
-    return InputFileError(f"{path}: cannot be read ({reason})")
 
 
 def _content(path: Path, most_bytes: int) -> bytes:

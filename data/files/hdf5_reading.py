@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.files.guard import OWN_EXPANSION, OWN_FREE_BYTES, first_reading, refusal
 from phasemark.inputs import checksum_path, is_vouched_for, verifying
+from phasemark.inputs.checksum import read_errors
 
 
 def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool = False) -> h5py.File:
@@ -42,13 +43,11 @@ def open_hdf5(path: Path, what: str, *, untrusted: bool = False, foreign: bool =
     UserWarning
         The file is untrusted and one of ours, and has no checksum.
     """
-    try:
+    with read_errors(path):
         if path.exists() and not (path.is_file() or path.is_dir()):
             raise InputFileError(f"{path}: is a pipe or device: HDF5 is read out of order, so copy it to a file first")
         with path.open("rb") as plain:
             signature = plain.read(8)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
     if signature != b"\x89HDF\r\n\x1a\n":
         raise InputFileError(f"{path}: not a {what} (not an HDF5 file)")
     vouched = is_vouched_for(path)

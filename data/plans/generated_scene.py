@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark import InputFileError, PhasemarkError, UsageError
+from phasemark import PhasemarkError, UsageError
+from phasemark.inputs.checksum import read_errors
 from phasemark.inputs.own_program import called_program, imported_program
 from phasemark.render import Background, Scene
 from phasemark.render.rigid import product, rigid_transforms, tilt2level
@@ -291,8 +292,6 @@ def sha256_of_files(paths: Sequence[str]) -> str:
     """
     digest = hashlib.sha256()
     for path in paths:
-        try:
+        with read_errors(Path(path)):
             digest.update(hashlib.sha256(Path(path).read_bytes()).digest())
-        except OSError as error:
-            raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
     return digest.hexdigest()
