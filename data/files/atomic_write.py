@@ -6,13 +6,14 @@ import os
 import secrets
 import stat
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
 from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.files import renames
 from phasemark.data.files.lock_file import exclusive
 from phasemark.inputs import checksum_line, checksum_path, read_checksum, sha256_of
+from phasemark.inputs.checksum import read_errors
 
 Buffer = bytes | bytearray | memoryview
 
@@ -86,7 +87,8 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
     parts = [target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial") for target in targets]
     try:
         with storage_errors(path):
-            _create(parts[0], private=real.exists())
+            # a new file gets the permissions that the umask leaves; one that replaces another gets those at the end
+            os.close(os.open(parts[0], os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600 if real.exists() else 0o666))
             yield parts[0]
             _finish(parts, targets, sha256_of(parts[0]) if checksum else None)
         _move_into_place(parts, targets, force=force)
@@ -149,37 +151,31 @@ def _publishing_names(path: Path) -> tuple[Path, Path]:
 
 def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
     """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
-    if len(targets) == 1:
-        _replace(parts, targets, force=force)
-        return
-    with storage_errors(targets[0]), exclusive(_lock_path(targets[0]), targets[0]):  # both are of the same run
-        _replace(parts, targets, force=force)
+    path, checksums = targets[0], targets[1:]
+    _, aside = _publishing_names(path)
+    # both are of the same run
+    with storage_errors(path), exclusive(_lock_path(path), path) if checksums else nullcontext():
+        for target in targets:  # somebody else may have been faster
+            refuse_unwritable(target, force=force)
+        try:
+            if checksums and checksums[0].exists():
+                os.replace(checksums[0], aside)
+            for part, target in zip(parts, targets, strict=True):
+                move(part, target, force=force)
+            sync(path.parent)
+        except BaseException:
+            if aside.exists() and parts[0].exists():  # the file is still the old one: give it its checksum back
+                with suppress(OSError):
+                    os.replace(aside, targets[1])
+            raise
+        finally:
+            if not parts[0].exists():
+                with suppress(OSError):
+                    aside.unlink(missing_ok=True)
 
 
 def _lock_path(path: Path) -> Path:
     return path.with_name(f".{path.name}.lock")
-
-
-def _replace(parts: list[Path], targets: list[Path], *, force: bool) -> None:
-    for target in targets:  # somebody else may have been faster
-        refuse_unwritable(target, force=force)
-    _, aside = _publishing_names(targets[0])
-    try:
-        with storage_errors(targets[0]):
-            if len(targets) > 1 and targets[1].exists():
-                os.replace(targets[1], aside)
-            for part, target in zip(parts, targets, strict=True):
-                move(part, target, force=force)
-            sync(targets[0].parent)
-    except BaseException:
-        if aside.exists() and parts[0].exists():  # the file is still the old one: give it its checksum back
-            with suppress(OSError):
-                os.replace(aside, targets[1])
-        raise
-    finally:
-        if not parts[0].exists():
-            with suppress(OSError):
-                aside.unlink(missing_ok=True)
 
 
 def move(part: Path, target: Path, *, force: bool) -> None:
@@ -216,10 +212,8 @@ def write_checksum(path: str | os.PathLike[str], *, force: bool = False) -> Path
         As in :func:`write_atomically`.
     """
     path = Path(path)
-    try:
+    with read_errors(path):
         digest = sha256_of(path)
-    except OSError as error:
-        raise InputFileError(f"{path}: cannot be read ({error.strerror})") from None
     return write_atomically(checksum_path(path), checksum_line(digest, path.name), force=force)
 
 
@@ -248,11 +242,6 @@ def storage_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise StorageError(f"{path}: cannot be written ({error.strerror or error})") from error
-
-
-def _create(path: Path, *, private: bool) -> None:
-    # A new file gets the permissions that the umask leaves; one that replaces another gets those at the end.
-    os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600 if private else 0o666))
 
 
 def take_over(part: Path, target: Path) -> None:
