@@ -16,7 +16,7 @@ from typing import Annotated
 import typer
 
 from phasemark import PhasemarkError, StorageError, UsageError, __version__
-from phasemark.data.commands import bank, frames, landmark, render, sensor, sensor_direct
+from phasemark.data.commands import bank, frames, landmark, render, sensor
 from phasemark.data.commands.command import Commands
 from phasemark.data.commands.console import report_error, tell, warnings_as_notes
 from phasemark.data.commands.interruption import Interruption
@@ -123,7 +123,7 @@ _add_commands(
 _add_commands(
     "sensor", "The cameras: shipped presets and sensor files.",
     sensor.sensor_list, sensor.sensor_show, sensor.sensor_import, characterise.sensor_characterise, sensor.sensor_fit,
-    sensor_direct.sensor_fit_direct,
+    sensor.sensor_fit_direct,
 )  # fmt: skip
 _add_commands(
     "bank", "Banks of model images.",

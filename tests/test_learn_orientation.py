@@ -10,7 +10,7 @@ from random_parts import random_part
 from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
-from phasemark.data.measured.orientation import ORIENTATIONS, Orientation
+from phasemark.data.measured.recording import ORIENTATIONS, Orientation
 from phasemark.data.plans import MeshPlan
 from phasemark.matcher import Matcher
 from phasemark.matcher.recordings import learn_orientation

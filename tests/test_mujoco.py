@@ -16,9 +16,8 @@ from phasemark import InputFileError, UsageError
 from phasemark.render import Scene, SceneRenderer, preset
 from phasemark.render.direct import HistogramFrames
 from phasemark.render.scene.mujoco_scene import seen_model
-from phasemark.render.simulators.cadence import Cadence
 from phasemark.render.simulators.gymnasium import TofObservation
-from phasemark.render.simulators.mujoco import TofSensor
+from phasemark.render.simulators.mujoco import Cadence, TofSensor
 
 AHEAD = 'xyaxes="0 -1 0 0 0 1"'  # a MuJoCo camera that looks along x of the world
 WALL = '<geom name="wall" type="box" size=".05 4 4" pos="2.05 0 0" rgba=".5 .5 .5 .9"/>'

@@ -56,7 +56,7 @@ def _echo_estimate(plan: AnyPlan, size: Mapping[str, int], fits: bool, building:
     """Print how large a build would be, and about how long it would take if it is not too large to be tried."""
     from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.arrays import too_many
-    from phasemark.data.shards.executor import processors
+    from phasemark.data.shards.build import processors
 
     facts: dict[str, Any] = dict(size)
     many = too_many(size)
@@ -72,7 +72,7 @@ def _note_large(plan: AnyPlan, out: Path, size: Mapping[str, int], parts: int, l
     """Refuse a file above the limit; say of a large one how large it is and about how long it takes."""
     from phasemark.data.partial_outputs import estimate_build
     from phasemark.data.plans.arrays import format_size, refuse_too_many
-    from phasemark.data.shards.executor import processors
+    from phasemark.data.shards.build import processors
     from phasemark.data.shards.run import refuse_unwritable_output
 
     n_bytes = size["bytes"]

@@ -15,8 +15,7 @@ import numpy as np
 from phasemark import InputFileError, UsageError
 from phasemark.data.measured import board_prints as prints
 from phasemark.data.measured.board_prints import BoardLog, Printed
-from phasemark.data.measured.orientation import Orientation
-from phasemark.data.measured.recording import Recording, note_disorder
+from phasemark.data.measured.recording import Orientation, Recording, note_disorder
 from phasemark.render import Sensor
 
 MOST_LOG_BYTES = 1 << 27

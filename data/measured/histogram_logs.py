@@ -19,8 +19,7 @@ from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
 from phasemark.data.measured.csv_frames import stated_in
-from phasemark.data.measured.possible_ranges import impossible_ranges
-from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, npz_arrays
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, impossible_ranges, npz_arrays
 from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.footprints import histogram_of

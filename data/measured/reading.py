@@ -23,13 +23,14 @@ from phasemark.data.files.hdf5_reading import open_hdf5
 from phasemark.data.measured.bags import read_rosbag
 from phasemark.data.measured.boards import HEAD_BYTES, MOST_LOG_BYTES, find_board, read_board_log
 from phasemark.data.measured.csv_frames import parse_csv
-from phasemark.data.measured.orientation import Orientation
-from phasemark.data.measured.possible_ranges import METRES_PER_UNIT, impossible_ranges
 from phasemark.data.measured.recording import (
+    METRES_PER_UNIT,
     SECONDS,
     SECONDS_PER_TIME_UNIT,
     TILTS,
+    Orientation,
     Recording,
+    impossible_ranges,
     note_disorder,
     npz_bytes,
     one_time,

@@ -14,11 +14,12 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,11 +30,13 @@ from phasemark.data.files.hdf5_layout import Layout, place
 from phasemark.data.files.json_text import json_text
 from phasemark.data.files.lock_file import lock_file
 from phasemark.data.progress import Progress
-from phasemark.data.shards.executor import Maker, processors, run_tasks
 from phasemark.inputs import checksum_path, sha256_of
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""
+
+T = TypeVar("T")
+R = TypeVar("R")
 
 _FORMAT = "phasemark-manifest"
 _SCHEMA_VERSION = 1
@@ -76,6 +79,52 @@ class Job(Protocol):
 
     def make(self, slab: int, start: int, stop: int) -> list[NDArray[Any]]:
         """Return the fields of some items of a slab, items first."""
+
+
+class Maker(Protocol):
+    """Makes shards somewhere else; any thread may ask at any time."""
+
+    def make(self, start: int, stop: int) -> Sequence[NDArray[Any]]:
+        """Return the arrays of a range of items."""
+
+    def concurrency(self) -> int:
+        """Return how many shards are worth asking for at once."""
+
+    def close(self) -> None:
+        """Close the executor; calls of :meth:`make` that wait for an answer fail."""
+
+
+def processors() -> int:
+    """Return how many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def run_tasks(
+    task: Callable[[T], R], todo: Iterable[T], n_threads: int, *, stop: Callable[[], None] | None = None
+) -> Iterator[tuple[T, R]]:
+    """Run a task on every item in threads, and yield (item, result) as they are done, in any order.
+
+    An exception of a task, or one that interrupts the caller, ends the run: items in work are finished, no other is
+    begun, and `stop` is called to cut short what waits for others.
+
+    Parameters
+    ----------
+    task : callable
+    todo : iterable
+    n_threads : int
+    stop : callable, optional
+    """
+    with ThreadPoolExecutor(max(n_threads, 1)) as pool:
+        items = {pool.submit(task, item): item for item in todo}
+        finished = False
+        try:
+            for future in as_completed(items):
+                yield items[future], future.result()
+            finished = True
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)
+            if not finished and stop is not None:
+                stop()
 
 
 def pieces(items: Sequence[int], start: int, stop: int) -> Iterator[tuple[int, int, int]]:

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import PhasemarkError, StorageError, UsageError
-from phasemark.data.shards.build import Job, difference, make_shard
-from phasemark.data.shards.executor import Maker
+from phasemark.data.shards.build import Job, Maker, difference, make_shard
 
 ATTEMPTS = 20
 """How often a shard is tried again when workers die under it."""

@@ -150,7 +150,7 @@ def calibrate_camera(
     write_distrusted
         Write a result that cannot be trusted, too; the file then names the doubts.
     """
-    from phasemark.data.shards.executor import processors
+    from phasemark.data.shards.build import processors
     from phasemark.matcher import calibrate
     from phasemark.matcher.calibration.known_poses import read_poses
 

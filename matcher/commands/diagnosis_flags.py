@@ -32,7 +32,7 @@ def diagnosis_text(diagnosis: Diagnosis, reading: FrameReading, nearest: bool, b
 
 def _flags(change: Change, reading: FrameReading, nearest: bool, bearing_fixed: bool) -> str:
     """Return the options that make one change."""
-    from phasemark.data.measured.possible_ranges import METRES_PER_UNIT
+    from phasemark.data.measured.recording import METRES_PER_UNIT
 
     value = change.value
     refine = "--method refine " if nearest else ""

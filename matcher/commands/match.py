@@ -24,7 +24,7 @@ from phasemark.matcher.commands.match_options import Landmark, Place, Results, S
 from phasemark.matcher.commands.match_table import Columns, bank_ends, match_rows, summary
 
 if TYPE_CHECKING:
-    from phasemark.data.measured.orientation import Orientation
+    from phasemark.data.measured.recording import Orientation
     from phasemark.matcher import FilteredFrames, Match, Matcher
     from phasemark.matcher.position.landmark_map import LandmarkMap
     from phasemark.matcher.recordings.direct_positions import DirectPositions

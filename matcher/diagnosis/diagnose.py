@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from phasemark import UsageError
 from phasemark.data import Bank
 from phasemark.data.bank.build_bank import rebuild_bank
-from phasemark.data.measured.orientation import Orientation
+from phasemark.data.measured.recording import Orientation
 from phasemark.matcher.diagnosis.search import SIZES, Fit, Search, wider
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, PixelState
 from phasemark.matcher.frequencies import OneFrequencyBank

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from phasemark.data.shards.executor import processors
+from phasemark.data.shards.build import processors
 from phasemark.matcher.chi_squared import largest_costs
 from phasemark.matcher.estimate.acceptance import rank, with_parts
 from phasemark.matcher.estimate.fits import Fits

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
-from phasemark.data.measured.orientation import ORIENTATIONS, Orientation
+from phasemark.data.measured.recording import ORIENTATIONS, Orientation
 from phasemark.matcher.filters.kalman_filters import kalman_filter
 from phasemark.matcher.match import Match
 from phasemark.matcher.matcher import Matcher

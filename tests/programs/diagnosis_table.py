@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data import BankPlan, build_bank
-from phasemark.data.measured.orientation import Orientation
+from phasemark.data.measured.recording import Orientation
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, diagnose, kalman_filter
 from phasemark.matcher.diagnosis import Diagnosis

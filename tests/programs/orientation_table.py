@@ -18,7 +18,7 @@ import numpy as np
 from random_parts import KINDS, random_part
 
 from phasemark.data import Bank, BankPlan, build_bank
-from phasemark.data.measured.orientation import ORIENTATIONS, Orientation
+from phasemark.data.measured.recording import ORIENTATIONS, Orientation
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import export_mesh
 from phasemark.matcher import Matcher
