@@ -9,8 +9,7 @@ import trimesh
 from builders import error_lines
 
 from phasemark.data import BankPlan
-from phasemark.data.bank import bank_cache
-from phasemark.data.bank.bank_cache import cached_bank
+from phasemark.data.bank.build_bank import cached_bank
 from phasemark.landmarks import export_mesh
 from phasemark.render import Background, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer
@@ -114,7 +113,7 @@ def test_banks_that_were_not_used_for_longest_are_thrown_away(cache, monkeypatch
     cached_bank(PLAN).close()
     (old,) = cache.glob("*.h5")
     os.utime(old, (1.0, 1.0))
-    monkeypatch.setattr(bank_cache, "_MOST_BYTES", old.stat().st_size + 1)
+    monkeypatch.setattr("phasemark.data.bank.build_bank._MOST_BYTES", old.stat().st_size + 1)
     cached_bank(PLAN.model_copy(update={"distance_m": (0.5,)})).close()
     left = list(cache.glob("*.h5"))
     assert len(left) == 1

@@ -1,9 +1,15 @@
-"""Banks of model images, as they are built: a job of shards, each rendered and placed in the file on its own."""
+"""Banks of model images, as they are built: a job of shards, each rendered and placed in the file on its own.
+
+Banks that are built as they are needed are kept in the user's cache folder under what they are made of.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -13,7 +19,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark import UsageError
+from phasemark import InputFileError, OutputExistsError, StorageError, UsageError
 from phasemark.data.bank.bank_file import Bank, open_bank
 from phasemark.data.files.hdf5_layout import Layout
 from phasemark.data.files.same_file import named_files
@@ -39,6 +45,8 @@ from phasemark.render.integral.area_integral import Variant
 from phasemark.render.planar import PlanarLandmark, planar_images
 
 ImagesOf = Callable[[Views], PhasorImages]
+_MOST_BYTES = 1 << 30
+"""Banks that were not used for longest are thrown away where all together are larger."""
 
 
 def build_bank(
@@ -109,6 +117,70 @@ def build_bank(
         shard_items=shard_items, scheduler=scheduler, progress=progress,
     )  # fmt: skip
     return open_bank(path)
+
+
+def cached_bank(plan: BankPlan, *, keep: bool = True, progress: Progress | None = None) -> Bank:
+    """Return a bank of a plan: the one that was kept, or a new one.
+
+    A bank is found again by what its bytes depend on: the contents of its meshes, the sensor, the grid and the versions
+    of the program and its libraries. One that is damaged is built again. Where nothing can be kept, because the folder
+    is full, read-only, or used by another run, the bank is a temporary one.
+
+    Parameters
+    ----------
+    plan : BankPlan
+    keep : bool
+        Whether to look for a kept bank, and to keep a new one.
+    progress : callable (done, total), optional
+        As for :func:`~phasemark.data.build_bank`.
+
+    Raises
+    ------
+    UsageError, InputFileError
+        As :func:`~phasemark.data.build_bank`.
+    """
+    folder = _cache_folder()
+    if not keep or folder is None:
+        return build_bank(plan, progress=progress)
+    path = folder / "banks" / f"{_key(plan)}.h5"
+    with suppress(InputFileError):
+        bank = open_bank(path)
+        with suppress(OSError):
+            os.utime(path)
+        return bank
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        bank = build_bank(plan, path, force=True, progress=progress)
+    except (OSError, OutputExistsError, StorageError):
+        return build_bank(plan, progress=progress)
+    _prune(path)
+    return bank
+
+
+def _cache_folder() -> Path | None:
+    """Return the folder of this program in the user's cache folder; None if there is no cache folder."""
+    folder = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(folder) / "phasemark" if os.path.isabs(folder) else None
+
+
+def _key(plan: BankPlan) -> str:
+    """Return a name for all that a bank's bytes depend on, wherever its mesh files lie."""
+    identity = BankJob(plan).identity()
+    for mesh in identity["plan"]["meshes"]:
+        del mesh["path"]
+    return hashlib.sha256(json.dumps(identity, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _prune(newest: Path) -> None:
+    """Throw away the banks that were not used for longest, until the others are small enough."""
+    with suppress(OSError):
+        kept = sorted(newest.parent.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
+        total = 0
+        for path in kept:
+            total += path.stat().st_size
+            if total > _MOST_BYTES and path != newest:
+                path.unlink()
+                path.with_name(path.name + ".sha256").unlink(missing_ok=True)
 
 
 def rebuild_bank(

@@ -294,7 +294,7 @@ class Landmark:
     def built(self, name: Path, camera_name: str, unit: MeshUnitWord | None, distance_m: Any) -> Bank:
         """Return the bank of a mesh or a class over some distances: a kept or a new one."""
         from phasemark.data import BankPlan
-        from phasemark.data.bank.bank_cache import cached_bank
+        from phasemark.data.bank.build_bank import cached_bank
         from phasemark.data.plans.bank_plan import MeshPlan
         from phasemark.landmarks import catalog
 
