@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.landmarks.revolve import Triangles, revolve
-from phasemark.landmarks.spec import Box, LandmarkSpec
+from phasemark.landmarks.spec import LandmarkSpec
 
 if TYPE_CHECKING:
     import trimesh
@@ -131,10 +131,11 @@ def build_surface(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = 
 
     solids: list[tuple[int, Triangles]] = []
     if part != "upper":
-        solids.append((LOWER, _box(spec.box)))
+        box = _BOX_CORNERS * (spec.box.length_m, spec.box.width_m, spec.box.height_m), _BOX_FACES
+        solids.append((LOWER, box))
     if part != "lower" and spec.upper is not None:
         solids.append((UPPER, revolve(spec.upper, tolerance_m, max_faces=MAX_FACES)))
-    stands_on_a_point = len(solids) == 2 and not _has_base(solids[1][1])
+    stands_on_a_point = len(solids) == 2 and np.sum(solids[1][1][0][:, 2] == 0) <= 1
     vertices, faces, parts = _side_by_side(solids) if len(solids) == 1 or stands_on_a_point else _union(solids)
     return Surface(
         vertices=np.asarray(vertices, np.float64),
@@ -142,15 +143,6 @@ def build_surface(spec: LandmarkSpec, part: Part = "both", tolerance_m: float = 
         face_attributes={"part": parts},
         metadata={"name": spec.name, "symmetry": spec.symmetry, "albedo": spec.albedo},
     )
-
-
-def _box(box: Box) -> Triangles:
-    return _BOX_CORNERS * (box.length_m, box.width_m, box.height_m), _BOX_FACES
-
-
-def _has_base(upper: Triangles) -> bool:
-    vertices, _ = upper
-    return int(np.sum(vertices[:, 2] == 0)) > 1
 
 
 _Labelled = tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.uint8]]

@@ -237,11 +237,14 @@ def _parse(content: bytes, kind: str, name: str) -> tuple[NDArray[np.float64], N
 
     The loader drops or repairs in silence what is damaged, so the file is checked before and what comes out after.
     """
-    if kind == "off":
-        content = _without_comments(content)
-    {"stl": _check_stl, "ply": _check_ply, "obj": _check_obj, "off": _check_off}[kind](content, name)
+    if kind == "off":  # without comments and blanks around them
+        lines = (line.partition(b"#")[0].strip() for line in content.splitlines())
+        content = b"\n".join(line for line in lines if line)
     if kind == "obj":
+        _check_count(len(re.findall(rb"^\s*f\s", content, re.MULTILINE)), name)
         content = _with_absolute_indices(content, name)
+    else:
+        {"stl": _check_stl, "ply": _check_ply, "off": _check_off}[kind](content, name)
     try:
         with np.errstate(all="ignore"):
             loaded: Any = trimesh.load(
@@ -344,12 +347,6 @@ def _check_off(content: bytes, name: str) -> None:
         raise InputFileError(f"{name}: cut off ({n_vertices} vertices and {n_faces} faces announced, fewer there)")
 
 
-def _without_comments(content: bytes) -> bytes:
-    """Return the lines of an OFF file that count, without comments and blanks around them."""
-    lines = (line.partition(b"#")[0].strip() for line in content.splitlines())
-    return b"\n".join(line for line in lines if line)
-
-
 def _with_absolute_indices(content: bytes, name: str) -> bytes:
     """Return an OBJ file whose faces count vertices from the first one.
 
@@ -380,7 +377,3 @@ def _absolute(corner: bytes, counts: list[int], where: str) -> bytes:
             index = b"%d" % (count + back + 1)
         found.append(index)
     return b"/".join(found)
-
-
-def _check_obj(content: bytes, name: str) -> None:
-    _check_count(len(re.findall(rb"^\s*f\s", content, re.MULTILINE)), name)

@@ -35,11 +35,6 @@ class Ring:
     phase: float = 0.0
 
     @property
-    def azimuths_rad(self) -> NDArray[np.float64]:
-        """Azimuths of the corners, ascending, (count,)."""
-        return np.asarray((np.arange(self.count) + self.phase) * (2 * math.pi / self.count), dtype=np.float64)
-
-    @property
     def vertices(self) -> NDArray[np.float64]:
         """Corners, (count, 3), metres.
 
@@ -47,7 +42,7 @@ class Ring:
         """
         if self.count == 1:
             return np.array([[0.0, 0.0, self.z_m]])
-        quarter = self.azimuths_rad[: self.count // 4]
+        quarter = (np.arange(self.count // 4) + self.phase) * (2 * math.pi / self.count)
         x, y = self.radius_m * np.cos(quarter), self.radius_m * np.sin(quarter)
         xy = np.vstack([np.c_[x, y], np.c_[-y, x], np.c_[-x, -y], np.c_[y, -x]])
         return np.asarray(np.c_[xy, np.full(self.count, self.z_m)])
@@ -78,10 +73,8 @@ def revolve(upper: Cylinder | Cone | Sphere | Revolution, tolerance_m: float, ma
         The tolerance asks for more than ``max_faces``.
     """
     if isinstance(upper, Sphere):
-        rings = sphere_rings(upper.radius_m, tolerance_m, max_faces)
-    else:
-        rings = profile_rings(outline(upper), tolerance_m, max_faces)
-    return _skin(rings)
+        return _skin(sphere_rings(upper.radius_m, tolerance_m, max_faces))
+    return _skin(profile_rings(outline(upper), tolerance_m, max_faces))
 
 
 def outline(upper: Cylinder | Cone | Revolution) -> tuple[tuple[float, float], ...]:
@@ -144,7 +137,10 @@ def sphere_rings(radius_m: float, tolerance_m: float, max_faces: int) -> list[Ri
         ]
         return [foot, *between, top]
 
-    return rings(radius_m * math.sqrt(4 * math.pi * radius_m**2 / _area(_skin(rings(radius_m)))))
+    vertices, faces = _skin(rings(radius_m))
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+    return rings(radius_m * math.sqrt(4 * math.pi * radius_m**2 / area))
 
 
 def _multiple_of_four(count: float, least: int = _MIN_SECTIONS) -> int:
@@ -154,12 +150,6 @@ def _multiple_of_four(count: float, least: int = _MIN_SECTIONS) -> int:
 def _refuse_more_than(max_faces: int, faces: float) -> None:
     if faces > max_faces:
         raise UsageError(f"'tolerance_m' asks for {faces:.2g} faces, more than {max_faces}: make it larger")
-
-
-def _area(triangles: Triangles) -> float:
-    vertices, faces = triangles
-    a, b, c = vertices[faces].swapaxes(0, 1)
-    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def _skin(rings: list[Ring]) -> Triangles:

@@ -61,7 +61,8 @@ def mesh_symmetry(mesh: trimesh.Trimesh) -> int:
     4
     """
     surface = _Surface(mesh)
-    if surface.is_revolution():
+    # a body of revolution may be turned by any angle: each point by one of its own, spread over the circle
+    if surface.lies_on_itself(_GOLDEN_ANGLE * np.arange(len(surface.points))):
         return MAX_SYMMETRY
     found = 1
     for prime in _primes(MAX_SYMMETRY):
@@ -115,17 +116,12 @@ class _Surface:
         self.points = np.random.default_rng(0).permutation(points)[:_MOST_POINTS]
         self.nearest = cKDTree(points)
 
-    def is_revolution(self) -> bool:
-        """Return True if the mesh may be turned by any angle: each point by one of its own, spread over the circle."""
-        return self._lies_on_itself(_GOLDEN_ANGLE * np.arange(len(self.points)))
-
     def repeats(self, n: int) -> bool:
         """Return True if turns by 360°/n, and by its multiples, leave the mesh as it is."""
         number, step = np.arange(len(self.points)), 2 * math.pi / n
         # many small differences add up: of the multiples each point takes one
-        return self._lies_on_itself(np.full(len(number), step)) and (
-            n == 2 or self._lies_on_itself(step * (1 + number % (n - 1)))
-        )
+        once = self.lies_on_itself(np.full(len(number), step))
+        return once and (n == 2 or self.lies_on_itself(step * (1 + number % (n - 1))))
 
     def holds(self, points: _Float) -> bool:
         """Return True if all points lie on the surface; stop at the first that does not."""
@@ -143,7 +139,7 @@ class _Surface:
         u, v = np.where(u + v > 1, 1 - u, u)[:, None], np.where(u + v > 1, 1 - v, v)[:, None]
         return np.asarray(a[face] + u * (b - a)[face] + v * (c - a)[face])
 
-    def _lies_on_itself(self, angle_rad: NDArray[np.floating[Any]]) -> bool:
+    def lies_on_itself(self, angle_rad: NDArray[np.floating[Any]]) -> bool:
         """Return True if every point, turned by its angle, lies on the surface; stop at the first that does not."""
         start, size = 0, _FIRST_POINTS
         points_at_once = 8192
