@@ -65,8 +65,7 @@ def explain(
     legend: Literal["best", "upper left", "lower right"] | None = None,
 ) -> None:
     """Give a panel its labels, title, grid, and a legend at a place that matplotlib knows."""
-    panel.set_xlabel(x)
-    panel.set_ylabel(y)
+    panel.set(xlabel=x, ylabel=y)
     if title is not None:
         panel.set_title(title, fontsize=9)
     if grid is not None:

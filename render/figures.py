@@ -6,7 +6,7 @@ Figures are built without pyplot, so that nothing here needs a display or touche
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.colors import BoundaryNorm, LinearSegmentedColormap, ListedColormap
@@ -58,8 +58,6 @@ _FLAG_COLOURS = {
     "dead": "#202020",
 }
 
-_GRID_STYLE: dict[str, Any] = {"color": "#2f6fe4", "linewidth": 0.7}
-
 
 def pixel_grid_figure(sensor: Sensor) -> Figure:
     """Draw the borders of a sensor's pixels on what it sees, in tangents.
@@ -78,20 +76,17 @@ def pixel_grid_figure(sensor: Sensor) -> Figure:
     figure = Figure(figsize=(7.0, 7.0 * min(1.4, max(0.6, sensor.rows / sensor.cols))), layout="constrained")
     axes = figure.add_subplot()
     along_u, along_v = np.linspace(0.0, sensor.cols, 201), np.linspace(0.0, sensor.rows, 201)
-    for v in [*range(0, sensor.rows, step), sensor.rows]:
-        y, z = sensor.tangents(along_u, float(v))
-        axes.plot(-np.broadcast_to(y, 201), np.broadcast_to(z, 201), **_GRID_STYLE)
-    for u in [*range(0, sensor.cols, step), sensor.cols]:
-        y, z = sensor.tangents(float(u), along_v)
-        axes.plot(-np.broadcast_to(y, 201), np.broadcast_to(z, 201), **_GRID_STYLE)
+    across = [(along_u, np.full(201, float(v))) for v in (*range(0, sensor.rows, step), sensor.rows)]
+    upright = [(np.full(201, float(u)), along_v) for u in (*range(0, sensor.cols, step), sensor.cols)]
+    for u, v in (*across, *upright):
+        y, z = sensor.tangents(u, v)
+        axes.plot(-y, z, color="#2f6fe4", linewidth=0.7)
     axes.plot(0.0, 0.0, "+", color="#d62728", markersize=12, label="optical axis")
     figure.legend(loc="outside lower center")
-    axes.set_aspect("equal")
-    axes.set_xlabel("tangent to the right")
-    axes.set_ylabel("tangent upwards")
     between = "each pixel" if step == 1 else f"every {step}th pixel border"
     lens = "ideal lens" if sensor.lens is None else f"lens: {sensor.lens.model}"
-    axes.set_title(f"{sensor.rows} × {sensor.cols} pixels, {between}, {lens}")
+    title = f"{sensor.rows} × {sensor.cols} pixels, {between}, {lens}"
+    axes.set(aspect="equal", xlabel="tangent to the right", ylabel="tangent upwards", title=title)
     return figure
 
 
@@ -252,9 +247,8 @@ def phasor_figure(images: PhasorImages, index: int = 0) -> Figure:
     near, far = landmark_limits_m(images.range_m[index], images.coverage[index])
     draw_range(left, images.range_m[index], near_m=near, far_m=far)
     draw_map(middle, images.amplitude[index], "amplitude", "amplitude |S| (1: albedo 1 at 1 m)", cmap="gray", vmin=0.0)
-    draw_map(
-        right, images.coverage[index], "coverage", "share of the pixel on the landmark", cmap="gray", vmin=0, vmax=1
-    )
+    share = "share of the pixel on the landmark"
+    draw_map(right, images.coverage[index], "coverage", share, cmap="gray", vmin=0, vmax=1)
     figure.suptitle(image_in_words(images.views, index))
     return figure
 
@@ -396,8 +390,7 @@ def _draw_pixels(axes: Axes, values: NDArray[np.generic], **how: object) -> Axes
     rows, cols = values.shape
     image = axes.imshow(values, extent=(0, cols, rows, 0), interpolation="nearest", **how)  # type: ignore[arg-type]
     whole_ticks(axes)
-    axes.set_xlabel("u (pixel columns)")
-    axes.set_ylabel("v (pixel rows)")
+    axes.set(xlabel="u (pixel columns)", ylabel="v (pixel rows)")
     return image
 
 

@@ -204,7 +204,6 @@ class Frames:
         sensor: Sensor,
         *,
         taps_e: NDArray[np.float64] | None = None,
-        by_frequency: Sequence[Frames] = (),
     ) -> Self:
         """Return frames that hold the arrays of a camera model themselves: nothing is copied, and nothing checked.
 
@@ -215,7 +214,7 @@ class Frames:
         range_m[flags != 0] = np.nan
         frames.range_m, frames.amplitude_e, frames.intensity_e, frames.flags = range_m, amplitude_e, intensity_e, flags
         frames.taps_e, frames.time_s, frames.tilt_rad, frames.sensor = taps_e, None, None, sensor
-        frames._by_frequency = tuple(by_frequency)
+        frames._by_frequency = ()
         return frames
 
     @property
@@ -263,17 +262,9 @@ class Frames:
         ranges_alone: bool = False,
     ) -> Self:
         """Return frames with `change` made to each array, (n, frames, ...); without taps and stamps if asked for."""
-        arrays: dict[str, Any] = {
-            name: change(values)
-            for name in (
-                "amplitude_e",
-                "intensity_e",
-                "flags",
-                "tilt_rad",
-                *(() if ranges_alone else ("taps_e", "time_s")),
-            )
-            if (values := getattr(self, name)) is not None
-        }
+        names = ("amplitude_e", "intensity_e", "flags", "tilt_rad", *(() if ranges_alone else ("taps_e", "time_s")))
+        held = {name: getattr(self, name) for name in names}
+        arrays: dict[str, Any] = {name: change(values) for name, values in held.items() if values is not None}
         cameras = [part.sensor for part in self._by_frequency] if sensor is None else sensor.by_frequency
         by_frequency = [
             part._rearranged(change, camera, ranges_alone=ranges_alone)

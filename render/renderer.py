@@ -582,8 +582,6 @@ class Renderer:
         low, high = self.topology.low, self.topology.high
         lens = views.lens_in_landmark()
         inside = ((lens > low - 1e-3) & (lens < high + 1e-3)).all(axis=1)
-        if not inside.any():
-            return
         inside &= np.hypot(lens[:, 0], lens[:, 1]) < self.footprint.radius_m + 1e-3
         near = np.flatnonzero(inside)
         if near.size:

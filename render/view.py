@@ -225,14 +225,8 @@ class Views:
         rotation[:, 1, 0] = np.sin(angle)
         rotation[:, 0, 1] = -rotation[:, 1, 0]
         rotation[:, 2, 2] = 1.0
-        translation = np.stack(
-            [
-                self.distance_m * np.cos(self.bearing_rad),
-                self.distance_m * np.sin(self.bearing_rad),
-                self.height_m,
-            ],
-            axis=-1,
-        )
+        x, y = self.distance_m * np.cos(self.bearing_rad), self.distance_m * np.sin(self.bearing_rad)
+        translation = np.stack([x, y, self.height_m], axis=-1)
         if not self.are_tilted:
             return rotation, translation
         level2tilt = self.tilt2level().transpose(0, 2, 1)
@@ -293,14 +287,8 @@ class Views:
 
     def lens_in_landmark(self) -> NDArray[np.float64]:
         """Return the lens in the landmark frame, (−D cos δ, −D sin δ, −h), as (n, 3)."""
-        return np.stack(
-            [
-                -self.distance_m * np.cos(self.delta_rad),
-                -self.distance_m * np.sin(self.delta_rad),
-                -self.height_m,
-            ],
-            axis=-1,
-        )
+        x, y = -self.distance_m * np.cos(self.delta_rad), -self.distance_m * np.sin(self.delta_rad)
+        return np.stack([x, y, -self.height_m], axis=-1)
 
 
 @dataclass(frozen=True)
