@@ -109,11 +109,6 @@ class SceneJob(Job, Generic[P]):
                 _write_mesh(layout.file.create_group(f"meshes/{landmark.name}"), landmark)
         return layout, places
 
-    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return one item as :meth:`read` does, made again."""
-        made = self.make(slab, item, item + 1)
-        return {name: values[0] for name, values in zip(self.fields, made, strict=True)}
-
     def attributes(self) -> dict[str, str]:
         """Return further attributes of the file."""
         return {}

@@ -133,10 +133,6 @@ class FramesJob(SceneJob[P]):
         """Return one item of a file in the form of :meth:`make`."""
         return {name: file[name][item * (n := self._rows(name)) : (item + 1) * n] for name in self.fields}
 
-    def remake(self, slab: int, item: int) -> dict[str, NDArray[Any]]:
-        """Return one item as :meth:`read` does, made again."""
-        return dict(zip(self.fields, self.make(slab, item, item + 1), strict=True))
-
     def _draws(self, first_view: int) -> dict[str, Any]:
         """Return the arguments of `capture` for the noise of some views."""
         rng = stream(self.plan.seed, "frames.noise", 0)
