@@ -15,8 +15,8 @@ from phasemark.data.export.lerobot import write_lerobot
 from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_jsonl, write_npz, write_targets_csv
 from phasemark.data.export.webdataset import write_webdataset
-from phasemark.data.files.atomic_write import refuse_unwritable, replacing
-from phasemark.data.files.replaced_folder import refuse_folder, replacing_folder
+from phasemark.data.files.atomic_write import replacing
+from phasemark.data.files.replaced_folder import replacing_folder
 from phasemark.data.files.same_file import refuse_inputs
 from phasemark.data.frames.frame_set_file import FrameSet, SceneFrameSet
 from phasemark.data.measured.reading import RangeOrZ
@@ -122,11 +122,9 @@ def export_frames(
     path = Path(path)
     refuse_inputs([path], [frames.path])
     if is_folder:
-        refuse_folder(path, force=force)
         with replacing_folder(path, f"frames export --to {to}", force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     else:
-        refuse_unwritable(path, force=force)
         with replacing(path, force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     return path
