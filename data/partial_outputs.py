@@ -191,8 +191,7 @@ def build_part(
     Path
         `path`.
     """
-    inputs = named_files(plan.model_dump())
-    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=named_files(plan.model_dump()))
     job = job_for(plan)
     return produce(
         PartJob(job, *part), path, finished=_finished_identity, force=force, resume=resume, workers=workers,

@@ -32,23 +32,20 @@ def imported_on_use(package: str) -> tuple[Callable[[str], object], Callable[[],
         name. The second lists the names.
     """
 
-    @cache
-    def homes() -> dict[str, str]:
-        return _homes(package)
-
     def attribute(name: str) -> object:
-        if name.startswith("__") or name not in homes():
+        if name.startswith("__") or name not in _homes(package):
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        value = getattr(importlib.import_module(homes()[name]), name)
+        value = getattr(importlib.import_module(_homes(package)[name]), name)
         setattr(sys.modules[package], name, value)
         return value
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *homes()})
+        return sorted({*vars(sys.modules[package]), *_homes(package)})
 
     return attribute, names
 
 
+@cache
 def _homes(package: str) -> dict[str, str]:
     """Return the module of each name that a package imports for type checkers."""
     spec = find_spec(package)

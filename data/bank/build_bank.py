@@ -109,8 +109,7 @@ def build_bank(
         with TemporaryDirectory(prefix="phasemark-") as folder:
             # The open file outlives its name.
             return build_bank(plan, Path(folder) / "bank.h5", workers=workers, progress=progress)
-    inputs = named_files(plan.model_dump())
-    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=named_files(plan.model_dump()))
     job = BankJob(plan)
     produce(
         job, path, finished=job.finished_identity, force=force, resume=resume, workers=workers,

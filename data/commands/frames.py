@@ -45,7 +45,6 @@ from phasemark.data.commands.outputs import (
 
 if TYPE_CHECKING:
     from phasemark.data.plans import SceneFramesPlan
-    from phasemark.render import Sensor
 
 ExportFormat = Literal["npz", "csv", "jsonl", "png16", "ply", "bop", "rosbag", "webdataset", "lerobot"]
 Generator = Annotated[str | None, Shown(metavar="MODULE:NAME", help="The program that makes the scenes.")]
@@ -247,7 +246,13 @@ def frames_simulate(
             raise UsageError(f"{option} goes with --moving: a camera at rest keeps its view")
     recording_format(out)
     camera = read_sensor(sensor)
-    _refuse_many_frames(n_frames, camera)
+    # most pixels of a simulated recording, all frames together: some hundred bytes of memory each
+    pixels, recorded_pixels = camera.rows * camera.cols, 5_000_000
+    if n_frames * pixels > recorded_pixels:
+        raise UsageError(
+            f"--frames must be at most {recorded_pixels // pixels} for {camera.rows} × {camera.cols} pixels: a"
+            " recording is made in memory; phasemark frames build makes large sets"
+        )
     refuse_unwritable_files([out], force)
     name, mesh = landmark.read()
     distance_m = 0.8 * view.distance if to_distance is None else to_distance
@@ -259,18 +264,6 @@ def frames_simulate(
     described = readable(f"landmark={name} sensor={Path(sensor).name}")
     description = f"{described} seed={seed} {'moving' if moving else 'still'}"
     echo(write_recording(recording, out, description=description, force=force))
-
-
-def _refuse_many_frames(n_frames: int, camera: Sensor) -> None:
-    """Refuse a recording that is too large to be made in memory."""
-    # most pixels of a simulated recording, all frames together: some hundred bytes of memory each
-    recorded_pixels = 5_000_000
-    if n_frames * camera.rows * camera.cols > recorded_pixels:
-        most = recorded_pixels // (camera.rows * camera.cols)
-        raise UsageError(
-            f"--frames must be at most {most} for {camera.rows} × {camera.cols} pixels: a recording is"
-            " made in memory; phasemark frames build makes large sets"
-        )
 
 
 def frames_show(

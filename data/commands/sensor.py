@@ -78,7 +78,12 @@ def sensor_show(
 
     sensor, sources = read_sensor(name_or_file), read_sensor_sources(name_or_file)
     if picture is not None:
-        _write_picture(sensor, picture, force)
+        from phasemark.render.figures import pixel_grid_figure
+
+        if picture.suffix != ".png":
+            raise UsageError(f"--picture must end in .png, got '{picture}'")
+        refuse_existing([picture], force)
+        write_figure(picture, pixel_grid_figure(sensor), force)
     if as_json:
         return echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
     if sensor.kind == "direct":
@@ -142,16 +147,6 @@ def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel]
     listed = f"{named}: {', '.join(rest)}" if rest else ""
     echo("" if named != "at their defaults" else f"\n{title}", *shown)
     echo(*(f"# {line}" for line in textwrap.wrap(listed, 118)))
-
-
-def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
-    """Write the picture of a sensor's pixel grid."""
-    from phasemark.render.figures import pixel_grid_figure
-
-    if picture.suffix != ".png":
-        raise UsageError(f"--picture must end in .png, got '{picture}'")
-    refuse_existing([picture], force)
-    write_figure(picture, pixel_grid_figure(sensor), force)
 
 
 def sensor_import(
@@ -333,7 +328,7 @@ def sensor_fit_direct(
     """
     from phasemark.data.files.same_file import refuse_inputs
     from phasemark.data.measured.histogram_logs import read_plane
-    from phasemark.render.direct import fit_direct_sensor
+    from phasemark.render.direct import fit_direct_sensor, score_zone_orders
     from phasemark.render.sensor.sensor_file import sensor_toml
 
     refuse_other_files(out, ".toml", "the sensor")
@@ -345,7 +340,10 @@ def sensor_fit_direct(
     recording = read_plane(plane, sensor=base, nearest_m=nearest)
     base = recording.frames.sensor
     objects = [_object(text, base) for text in known or []]
-    scores = _zone_orders(known, base)
+    scores: dict[str, float] = {}
+    if known and base.histogram is not None:
+        plain = base.with_(histogram={**base.histogram.model_dump(), "zone_order": ()})
+        scores = score_zone_orders(_object(known[0], plain), plain)
     with LongWork("fitting"):
         fit = fit_direct_sensor(recording, objects, base=base)
     header = [f"Fitted by phasemark to {plane.name}" + "".join(f", {one.name}" for one in objects)]
@@ -380,16 +378,6 @@ def _echo_fit(fit: DirectFit, spread_mm: list[float]) -> None:
         ("zone", "range r.m.s. (mm)", "chi2/nu"),
         ((str(k), f"{s:.2f}", f"{c:.3g}") for k, (s, c) in enumerate(zip(spread_mm, fit.reduced_chi2, strict=True))),
     )
-
-
-def _zone_orders(known: list[str] | None, base: Sensor) -> dict[str, float]:
-    """Return the score of each order of the zones from the first object; nothing without one."""
-    from phasemark.render.direct import score_zone_orders
-
-    if not known or base.histogram is None:
-        return {}
-    plain = base.with_(histogram={**base.histogram.model_dump(), "zone_order": ()})
-    return score_zone_orders(_object(known[0], plain), plain)
 
 
 def _object(text: str, sensor: Sensor) -> ObjectRecording:

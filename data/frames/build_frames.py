@@ -92,8 +92,7 @@ def build_frames(
         plan = FramePlan(**plan)
     if not isinstance(plan, FramePlan | SceneFramesPlan):
         raise UsageError(f"'plan' must be a FramePlan or a SceneFramesPlan, got {plan!r}")
-    inputs = named_files(plan.model_dump())
-    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=inputs)
+    refuse_unwritable_output(Path(path), force=force, resume=resume, inputs=named_files(plan.model_dump()))
     job = frames_job(plan)
     job.check_views()
     produce(

@@ -220,7 +220,10 @@ def frames_of(
                 " and VL53L8CX)"
             )
         valid &= np.isin(arrays["status"], list(valid_status))
-    time_s, tilt_rad = _frame_times_s(raw, valid.shape[:2], path), _frame_tilts_rad(raw, valid.shape[:2], path)
+    n_frames = valid.shape[:2]
+    time_s = None if raw.time_s is None else _of_each_frame(raw.time_s, "the time stamps", n_frames, path)
+    tilts = {name: _of_each_frame(values, f"'{name}'", n_frames, path) for name, values in raw.tilt_deg.items()}
+    tilt_rad = np.radians(np.stack([tilts.get(name, np.zeros(n_frames)) for name in TILTS], axis=-1)) if tilts else None
     upright = Orientation(flip_h, rotate)
     arrays = {name: upright.apply(values[..., ::-1, :] if flip_v else values) for name, values in arrays.items()}
     valid = upright.apply(valid[..., ::-1, :] if flip_v else valid)
@@ -252,19 +255,6 @@ def frames_of(
         return unwrap_frames(parts, sensor, taps_e=taps_e)
     except UsageError as error:  # an amplitude or intensity that cannot be
         raise InputFileError(f"{path}: {error}") from None
-
-
-def _frame_times_s(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
-    """Return the time stamps as (n, frames)."""
-    return None if raw.time_s is None else _of_each_frame(raw.time_s, "the time stamps", shape, path)
-
-
-def _frame_tilts_rad(raw: Recording, shape: tuple[int, ...], path: Path) -> NDArray[np.float64] | None:
-    """Return the pitch and roll of each frame, (n, frames, 2), 0 for the one that a file lacks."""
-    if not raw.tilt_deg:
-        return None
-    each = {name: _of_each_frame(values, f"'{name}'", shape, path) for name, values in raw.tilt_deg.items()}
-    return np.radians(np.stack([each.get(name, np.zeros(shape)) for name in TILTS], axis=-1))
 
 
 def _of_each_frame(values: NDArray[np.float64], what: str, shape: tuple[int, ...], path: Path) -> NDArray[np.float64]:

@@ -213,14 +213,6 @@ def _truth(views: Views) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _zones(frames: Frames) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return z in millimetres, 0 where there is no reading, and status codes; (frames, rows, cols)."""
-    z_mm = np.round(1e3 * np.nan_to_num(frames.z_m[0])).astype(np.int64)
-    missing = (frames.flags[0] & int(Flag.MISSING)) > 0
-    status = np.where(frames.valid[0], STATUS_VALID, np.where(missing, STATUS_NO_UPDATE, STATUS_NO_TARGET))
-    return z_mm, status
-
-
 def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str, str]:
     """Return the arrays of NPZ and HDF5 files, with unit and quantity."""
     frames = recording.frames
@@ -228,7 +220,10 @@ def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str
     arrays: dict[str, NDArray[Any]] = {"t_s": frames.time_s[0]}
     direct = frames.sensor.kind == "direct"
     if direct:
-        arrays["range"], arrays["status"] = _zones(frames)
+        arrays["range"] = np.round(1e3 * np.nan_to_num(frames.z_m[0])).astype(np.int64)  # 0 where there is no reading
+        missing = (frames.flags[0] & int(Flag.MISSING)) > 0
+        without = np.where(missing, STATUS_NO_UPDATE, STATUS_NO_TARGET)
+        arrays["status"] = np.where(frames.valid[0], STATUS_VALID, without)
     else:
         arrays["range"], arrays["valid"] = frames.range_m[0], frames.valid[0]
         for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):

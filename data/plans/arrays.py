@@ -151,12 +151,10 @@ def frame_set_fields(plan: FramePlan | SceneFramesPlan, sensor: Sensor) -> dict[
         return {name: FIELDS[name] for name in names}
     names += ("shares",) if "shares" in plan.keep else ()
     names += POSE_FIELDS if "poses" in plan.keep else ()
-    labels = {f"label_{name}": _label(name, kind) for name, kind in (plan.scenes.labels or {}).items()}
+    kinds = {"number": "<f8", "text": f"|S{LABEL_BYTES}"}
+    stated = (plan.scenes.labels or {}).items()
+    labels = {f"label_{name}": Array(("view",), kinds[kind], "1", f"label '{name}'") for name, kind in stated}
     return {name: FIELDS[name] for name in names} | labels
-
-
-def _label(name: str, kind: str) -> Array:
-    return Array(("view",), "<f8" if kind == "number" else f"|S{LABEL_BYTES}", "1", f"label '{name}'")
 
 
 def sizes_of_scenes(plan: SceneFramesPlan) -> dict[str, int]:

@@ -135,8 +135,7 @@ def _to_distribution(value: Any, info: ValidationInfo) -> Any:
         try:
             return Distribution(**value)
         except UsageError as error:
-            text = str(error)
-            raise UsageError(f"'{info.field_name}': {text}") from None
+            raise UsageError(f"'{info.field_name}': {error}") from None
     return value
 
 
@@ -300,9 +299,7 @@ class FramePlan(ScenePlan):
                 raise UsageError(f"'{name}' must be positive throughout, got {_to_plain(spread)}{hint}")
         for name in ("distance_m", "height_m", "wall_m", "floor_m"):
             spread = getattr(self, name)
-            if spread is not None and any(
-                math.isfinite(end) and abs(end) > FARTHEST_M for end in (spread.lowest, spread.highest)
-            ):
+            if spread is not None and any(math.isfinite(end) and abs(end) > FARTHEST_M for end in spread.limits):
                 raise UsageError(f"'{name}' must be at most {FARTHEST_M:g} m throughout, got {_to_plain(spread)}")
         for name, most in (("pitch_deg", 90.0), ("roll_deg", 180.0)):
             spread = getattr(self, name)

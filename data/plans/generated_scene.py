@@ -81,11 +81,13 @@ class PlacedScene:
         """Return True if bodies, poses and labels are equal."""
 
         def bodies(placed: PlacedScene) -> list[tuple[Any, ...]]:
-            arrays = [(one.albedo, one.mesh.vertices, one.mesh.faces) for one in placed.scene or ()]
-            numbers = [
-                (one.name, one.smooth, one.retroreflecting, one.specular, one.shininess) for one in placed.scene or ()
+            return [
+                (
+                    (one.name, one.smooth, one.retroreflecting, one.specular, one.shininess),
+                    *(np.asarray(array).tobytes() for array in (one.albedo, one.mesh.vertices, one.mesh.faces)),
+                )
+                for one in placed.scene or ()
             ]
-            return [*numbers, *(tuple(np.asarray(array).tobytes() for array in own) for own in arrays)]
 
         return (
             bodies(self) == bodies(other)
