@@ -236,8 +236,7 @@ def million() -> Table:
     """Build a million noisy frames with their truth, and say how much of the time is not spent on making them."""
     code = (
         "from phasemark.data import FramePlan, build_frames; from phasemark.data.frames.build_frames import FrameJob;"
-        "from phasemark.data.shards.build import processors, run_tasks;"
-        "from phasemark.data.shards.build import SHARD_BYTES, make_shard;"
+        "from phasemark.data.shards.build import SHARD_BYTES, make_shard, processors, run_tasks;"
         "plan = FramePlan(views=250_000, frames_per_view=4, seed=7, wall_m=4.0);"
         "job = FrameJob(plan); size = job.lay_out()[0].size; items = max(1, SHARD_BYTES * plan.views // size);"
         "make_shard(job, 0, items);"

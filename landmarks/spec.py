@@ -140,17 +140,15 @@ class Revolution(FieldTable):
 def _touches_itself(points: NDArray[np.float64]) -> bool:
     """Return True if two segments of a polyline that are not neighbours share a point, or neighbours fold back."""
     start, step = points[:-1], np.diff(points, axis=0)
-    n = len(step)
-    folds = np.array(
-        [step[i, 0] * step[i + 1, 1] == step[i, 1] * step[i + 1, 0] and step[i] @ step[i + 1] < 0 for i in range(n - 1)]
-    )
-    if folds.any():
+    before, after = step[:-1], step[1:]
+    parallel = before[:, 0] * after[:, 1] == before[:, 1] * after[:, 0]
+    if (parallel & ((before * after).sum(axis=1) < 0)).any():
         return True
 
     def side(i: NDArray[np.intp], p: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(np.sign(step[i, 0] * (p[:, 1] - start[i, 1]) - step[i, 1] * (p[:, 0] - start[i, 0])))
 
-    i, j = np.triu_indices(n, k=2)
+    i, j = np.triu_indices(len(step), k=2)
     end = points[1:]
     crossing = (side(i, start[j]) * side(i, end[j]) <= 0) & (side(j, start[i]) * side(j, end[i]) <= 0)
     apart = np.any(

@@ -107,10 +107,10 @@ class Frames:
     ) -> None:
         refuse_no_sensor(sensor)
         refuse_other_meaning(invalid_means)
-        given = ranges = real_array("range_m", np.ma.getdata(range_m))
+        ranges = real_array("range_m", np.ma.getdata(range_m))
         if ranges.ndim not in (2, 3, 4):
             raise UsageError(f"'range_m' must have shape (n, frames, rows, cols), got {ranges.shape}")
-        shape = (1,) * (4 - ranges.ndim) + ranges.shape
+        of_frames, shape = ranges.shape[:-2], (1,) * (4 - ranges.ndim) + ranges.shape
         if shape[2:] != (sensor.rows, sensor.cols):
             raise UsageError(
                 f"the frames have {shape[2]} × {shape[3]} pixels, but the sensor has {sensor.rows} × {sensor.cols}"
@@ -159,19 +159,14 @@ class Frames:
         self.flags: NDArray[np.uint8] = codes
         self.taps_e: NDArray[np.float64] | None = None
         if taps_e is not None:
-            taps = real_array("taps_e", taps_e)
             taps_per_phase_image = 2
             of_pixel = (sensor.n_phase_images, taps_per_phase_image)
-            expected = (*given.shape[:-2], *of_pixel, *given.shape[-2:])
-            if taps.shape != expected:
-                raise UsageError(f"'taps_e' has shape {taps.shape}, but must have {expected}")
+            taps = _shaped("taps_e", taps_e, (*of_frames, *of_pixel, *shape[2:]))
             self.taps_e = taps.reshape(*shape[:2], *of_pixel, *shape[2:])
         self.time_s: NDArray[np.float64] | None = None
         """Time stamps, (n, frames) seconds, or None."""
         if time_s is not None:
-            times = real_array("time_s", time_s)
-            if times.shape != given.shape[:-2]:
-                raise UsageError(f"'time_s' has shape {times.shape}, but must have {given.shape[:-2]}")
+            times = _shaped("time_s", time_s, of_frames)
             if not np.isfinite(times).all():
                 k = int(np.flatnonzero(~np.isfinite(times.ravel()))[0])
                 raise UsageError(f"'time_s' must be finite, got {times.ravel()[k]} at frame {k}")
@@ -179,9 +174,7 @@ class Frames:
         self.tilt_rad: NDArray[np.float64] | None = None
         """Pitch and roll, (n, frames, 2) radians, or None."""
         if tilt_rad is not None:
-            tilts = real_array("tilt_rad", tilt_rad)
-            if tilts.shape != (*given.shape[:-2], 2):
-                raise UsageError(f"'tilt_rad' has shape {tilts.shape}, but must have {(*given.shape[:-2], 2)}")
+            tilts = _shaped("tilt_rad", tilt_rad, (*of_frames, 2))
             wrong = ~(np.abs(tilts) <= math.radians(MOST_TILT_DEG))
             if wrong.any():
                 k = int(np.flatnonzero(wrong.reshape(-1, 2).any(axis=1))[0])
@@ -298,6 +291,14 @@ class Frames:
     def _repr_png_(self) -> bytes | None:
         """Show the first frame in a notebook; nothing where there is none."""
         return figure_png(self.plot()) if self.range_m.size else None
+
+
+def _shaped(name: str, value: ArrayLike, expected: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return numbers that must have a shape, as an array of their own."""
+    array = real_array(name, value)
+    if array.shape != expected:
+        raise UsageError(f"'{name}' has shape {array.shape}, but must have {expected}")
+    return array
 
 
 def refuse_other_meaning(invalid_means: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -45,12 +45,6 @@ def phasor_to_range_m(phasor: NDArray[np.complexfloating], sensor: Sensor) -> ND
     np.copyto(range_m, 0.0, where=range_m >= sensor.period_m)
     np.copyto(range_m, np.nan, where=phasor == 0)
     return range_m
-
-
-def _orders_of(hz: float, frequencies_hz: Sequence[float]) -> set[int]:
-    """Return which harmonic orders k > 1 of some frequencies a frequency is."""
-    orders = (round(hz / own) for own in frequencies_hz)
-    return {k for k, own in zip(orders, frequencies_hz, strict=True) if k > 1 and k * own == hz}
 
 
 def wrap_range_m(range_m: ArrayLike, sensor: Sensor) -> NDArray[np.float64]:
@@ -169,13 +163,12 @@ class PhasorImages:
         if len(self.sensor.frequencies_hz) == 1:
             return (self,)
         known = self._known_hz()
-        orders = {k for hz in known for k in _orders_of(hz, self.sensor.frequencies_hz)}
         return tuple(
             replace(
                 self,
                 phasor=self.at_frequency(hz),
                 sensor=camera,
-                harmonics={k: known[k * hz] for k in sorted(orders) if k * hz in known},
+                harmonics={k: known[own] for own in sorted(known) if (k := round(own / hz)) > 1 and k * hz == own},
                 by_hz={},
             )
             for hz, camera in zip(self.sensor.frequencies_hz, self.sensor.by_frequency, strict=True)

@@ -55,10 +55,8 @@ class PlanarLandmark:
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise UsageError(f"'{name}' must be a positive number of metres, got {value!r}")
-        if callable(self.profile_m):
-            return
-        points = _outline(self.profile_m)
-        object.__setattr__(self, "profile_m", points)
+        if not callable(self.profile_m):
+            object.__setattr__(self, "profile_m", _outline(self.profile_m))
 
     def radius_m(self, z_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the radius of the upper part at heights above the box, 0 where there is none; same shape as `z_m`."""
@@ -252,10 +250,8 @@ def _meet_box(
     distance[distance <= 0] = np.inf  # behind the lens
     cos_incidence = np.abs(across) / np.linalg.norm(next_corners - corners, axis=-1)[..., None]
     nearest = np.argmin(distance, axis=1)[:, None]
-    return (
-        np.take_along_axis(distance, nearest, axis=1)[:, 0],
-        np.take_along_axis(cos_incidence, nearest, axis=1)[:, 0],
-    )
+    met, facing = (np.take_along_axis(values, nearest, axis=1)[:, 0] for values in (distance, cos_incidence))
+    return met, facing
 
 
 def _meet_circles(

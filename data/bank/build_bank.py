@@ -38,7 +38,7 @@ from phasemark.data.progress import Progress
 from phasemark.data.scene_job import Landmark, SceneJob, StoredMesh, make_scale, read_landmarks, reserve_array
 from phasemark.data.shards.build import Place
 from phasemark.data.shards.run import produce, refuse_unwritable_output
-from phasemark.landmarks import LandmarkSpec, build_mesh
+from phasemark.landmarks import build_mesh
 from phasemark.landmarks.spec import Revolution
 from phasemark.render import PhasorImages, Renderer, Sensor, Views
 from phasemark.render.integral.area_integral import Variant
@@ -371,7 +371,9 @@ def _images_of(
     """
     if plan.model == "planar":
         assert landmark.spec is not None  # _refuse_impossible has seen to it
-        outline = _top_view(landmark.spec)
+        box, upper = landmark.spec.box, landmark.spec.upper
+        profile = upper.profile_m if isinstance(upper, Revolution) else () if upper is None else upper.radius_at_m
+        outline = PlanarLandmark(box.length_m, box.width_m, profile)  # as the paper's generator describes it
         return lambda views: planar_images(
             outline, sensor, views, albedo=landmark.albedo, harmonics=plan.harmonics, rows=rows
         ), None
@@ -379,15 +381,6 @@ def _images_of(
     renderer = Renderer(mesh, sensor, albedo=landmark.albedo, harmonics=plan.harmonics)
     variant: Variant = "hard" if plan.model == "hard" else "exact"
     return lambda views: renderer.render_views(views, rows=rows, variant=variant), renderer
-
-
-def _top_view(spec: LandmarkSpec) -> PlanarLandmark:
-    """Return a landmark as the paper's generator describes it."""
-    upper = spec.upper
-    if upper is None:
-        return PlanarLandmark(spec.box.length_m, spec.box.width_m)
-    profile = upper.profile_m if isinstance(upper, Revolution) else upper.radius_at_m
-    return PlanarLandmark(spec.box.length_m, spec.box.width_m, profile)
 
 
 def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:

@@ -90,8 +90,8 @@ def replacing(path: str | os.PathLike[str], *, force: bool = False, checksum: bo
             # a new file gets the permissions that the umask leaves; one that replaces another gets those at the end
             os.close(os.open(parts[0], os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600 if real.exists() else 0o666))
             yield parts[0]
-            _finish(parts, targets, sha256_of(parts[0]) if checksum else None)
-        _move_into_place(parts, targets, force=force)
+            digest = sha256_of(parts[0]) if checksum else None
+        _put_in_place(parts, targets, digest, force=force)
     finally:
         for leftover in parts:
             with suppress(OSError):
@@ -119,21 +119,10 @@ def publish(part: Path, path: Path, digest: str, *, force: bool) -> None:
     """
     parts, targets = [part, _publishing_names(path)[0]], [path, checksum_path(path)]
     try:
-        with storage_errors(path):
-            _finish(parts, targets, digest)
-        _move_into_place(parts, targets, force=force)
+        _put_in_place(parts, targets, digest, force=force)
     finally:
         with suppress(OSError):
             parts[1].unlink(missing_ok=True)
-
-
-def _finish(parts: list[Path], targets: list[Path], digest: str | None) -> None:
-    """Write the checksum, if any, and have files with the permissions of those that they replace on the disk."""
-    if digest is not None:
-        parts[1].write_bytes(checksum_line(digest, targets[0].name))
-    for part, target in zip(parts, targets, strict=True):
-        take_over(part, target)
-        sync(part)
 
 
 def finish_publishing(path: Path) -> None:
@@ -149,9 +138,18 @@ def _publishing_names(path: Path) -> tuple[Path, Path]:
     return path.with_name(f".{name}.partial"), path.with_name(f".{name}.old")
 
 
-def _move_into_place(parts: list[Path], targets: list[Path], *, force: bool) -> None:
-    """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go."""
+def _put_in_place(parts: list[Path], targets: list[Path], digest: str | None, *, force: bool) -> None:
+    """Replace a file, and then its checksum; the old checksum steps aside first and returns if the file cannot go.
+
+    Before that the checksum is written, and the new files, with the permissions of those that they replace, are synced.
+    """
     path, checksums = targets[0], targets[1:]
+    with storage_errors(path):
+        if digest is not None:
+            parts[1].write_bytes(checksum_line(digest, path.name))
+        for part, target in zip(parts, targets, strict=True):
+            take_over(part, target)
+            sync(part)
     _, aside = _publishing_names(path)
     # both are of the same run
     with storage_errors(path), exclusive(_lock_path(path), path) if checksums else nullcontext():

@@ -58,7 +58,11 @@ def replacing_folder(path: Path, content: str, *, force: bool = False) -> Iterat
     real = _followed(path)
     staging, aside = (real.with_name(f".{real.name}.{kind}") for kind in ("partial", "old"))
     with storage_errors(path), exclusive(real.with_name(f".{real.name}.lock"), path):
-        _recover(real, staging, aside)
+        # what a killed run left: the old folder gets its name back unless the new one has it
+        if aside.is_dir() and not real.exists() and read_marker(aside)[0]:
+            os.replace(aside, real)
+        for leftover in (staging, aside):
+            _discard(leftover)
         refuse_folder(path, force=force)  # another run may have finished before the lock was ours
         staging.mkdir(mode=0o700 if real.exists() else 0o777)
         try:
@@ -126,14 +130,6 @@ def _give_name(staging: Path, real: Path, aside: Path) -> None:
             os.replace(aside, real)
         raise
     _discard(aside)
-
-
-def _recover(real: Path, staging: Path, aside: Path) -> None:
-    """Tidy up what a killed run left: the old folder gets its name back unless the new one has it."""
-    if aside.is_dir() and not real.exists() and read_marker(aside)[0]:
-        os.replace(aside, real)
-    for leftover in (staging, aside):
-        _discard(leftover)
 
 
 def _discard(folder: Path) -> None:

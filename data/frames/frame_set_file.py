@@ -106,9 +106,7 @@ class FrameSet(StoredScene):
         self._arrays = self._wanted(file)
         sizes |= sizes_of_scenes(self.plan) if isinstance(self.plan, SceneFramesPlan) else {}
         self._fields = {name: self._field(file, name, array, sizes) for name, array in self._arrays.items()}
-        self.view_index = frozen(self._whole(file, "view_index", sizes["frame"]))
-        if self.view_index.min() < 0 or self.view_index.max() >= sizes["view"]:
-            raise InputFileError(f"{path}: 'view_index' names views that are not there")
+        self.view_index = frozen(self._numbers(file, "view_index", "view_index", sizes["frame"], sizes["view"]))
         self.truth = self._read_truth(file, sizes["view"])
 
     @classmethod
@@ -182,13 +180,10 @@ class FrameSet(StoredScene):
             raise InputFileError(f"{self.path}: '{name}' must be {n} numbers, got {dataset.dtype} of {dataset.shape}")
         return np.asarray(dataset[...])
 
-    def _whole(self, file: h5py.File, name: str, n: int) -> NDArray[np.int64]:
-        self._column(file, name, n)
-        return whole_numbers(file[name], self.path)
-
     def _numbers(self, file: h5py.File, name: str, key: str, n: int, count: int) -> NDArray[np.int64]:
         """Return n whole numbers from 0 to `count` − 1."""
-        found = self._whole(file, name, n)
+        self._column(file, name, n)
+        found = whole_numbers(file[name], self.path)
         if found.min() < 0 or found.max() >= count:
             raise InputFileError(f"{self.path}: '{key}' has numbers outside 0 … {count - 1}")
         return found

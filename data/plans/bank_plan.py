@@ -111,20 +111,15 @@ class PlanModel(FieldTable):
         # a key that is misspelt is missing too: naming the misspelling helps more
         first = min(error.errors(), key=lambda found: found["type"] != "extra_forbidden")
         if first["type"] == "extra_forbidden" and len(first["loc"]) == 1:
-            return cls._unknown_key(str(first["loc"][0]))
+            key, keys = str(first["loc"][0]), list(cls.model_fields)
+            similar = difflib.get_close_matches(key, keys, n=1)
+            hint = f"did you mean '{similar[0]}'?" if similar else f"there are {', '.join(keys)}"
+            return UsageError(f"unknown key '{key}': {cls.place_of_key(key) or hint}")
         own = first.get("ctx", {}).get("error")
         if isinstance(own, UsageError):
             key = ".".join(map(str, first["loc"]))
             return own if f"'{key}'" in str(own) or not key else UsageError(f"{key}: {own}")
         return cls._refusal(first)
-
-    @classmethod
-    def _unknown_key(cls, key: str) -> UsageError:
-        """Describe for an unknown key where it belongs, which known key it resembles, or which keys exist."""
-        keys = list(cls.model_fields)
-        similar = difflib.get_close_matches(key, keys, n=1)
-        hint = f"did you mean '{similar[0]}'?" if similar else f"there are {', '.join(keys)}"
-        return UsageError(f"unknown key '{key}': {cls.place_of_key(key) or hint}")
 
     @classmethod
     def place_of_key(cls, key: str) -> str | None:

@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NoReturn, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,6 @@ from phasemark.inputs import checksum_path, sha256_of
 
 SHARD_BYTES = 1 << 22
 """About how much of the file a shard holds; what a killed run loses is a few of these."""
-
-T = TypeVar("T")
-R = TypeVar("R")
 
 _FORMAT = "phasemark-manifest"
 _SCHEMA_VERSION = 1
@@ -100,8 +97,8 @@ def processors() -> int:
 
 
 def run_tasks(
-    task: Callable[[T], R], todo: Iterable[T], n_threads: int, *, stop: Callable[[], None] | None = None
-) -> Iterator[tuple[T, R]]:
+    task: Callable[[int], Any], todo: Iterable[int], n_threads: int, *, stop: Callable[[], None] | None = None
+) -> Iterator[tuple[int, Any]]:
     """Run a task on every item in threads, and yield (item, result) as they are done, in any order.
 
     An exception of a task, or one that interrupts the caller, ends the run: items in work are finished, no other is
