@@ -509,7 +509,9 @@ class Renderer:
         With `slope`, (m, pixels of all views, p), it is filled with how the phasors at each of the sensor's m
         frequencies change with `parameters`.
         """
-        order = self._by_direction(views) if slope is None else slice(None)
+        order: slice | NDArray[np.int64] = slice(None)
+        if slope is None and len(self.topology.faces) >= _LARGE:  # side after side: the cache does not hold all of it
+            order = np.argsort(views.delta_rad, kind="stable")
         ordered, behind = views[order], background[order]
         slopes = None
         if slope is not None:
@@ -568,12 +570,6 @@ class Renderer:
             frequencies = [0.0, *columns_hz]
             self._standing = standing_light(self.topology, self.albedo, self.sensor, frequencies)
         return self._standing
-
-    def _by_direction(self, views: Views) -> slice | NDArray[np.int64]:
-        """Return in which order to render views: a large mesh side after side, for the cache does not hold it all."""
-        if len(self.topology.faces) < _LARGE:
-            return slice(None)
-        return np.argsort(views.delta_rad, kind="stable")
 
     def _check_lens_outside(self, views: Views) -> None:
         """Refuse views whose lens is inside the landmark's box and no farther from the axis than its vertices."""

@@ -85,11 +85,6 @@ def entries_of(folder: Path) -> Iterator[str]:
                 yield entry
 
 
-def foreign_entry(folder: Path, listed: set[str]) -> str | None:
-    """Return something that a folder holds and its marker does not list, or None."""
-    return next((entry for entry in entries_of(folder) if entry not in listed), None)
-
-
 def remove_listed(folder: Path, listed: set[str]) -> None:
     """Remove what a marker lists from a folder; what it does not list stays, and so do folders that hold it.
 
@@ -98,9 +93,7 @@ def remove_listed(folder: Path, listed: set[str]) -> None:
     OSError
         Something cannot be removed.
     """
-    for entry in list(entries_of(folder)):
-        if entry not in listed:
-            continue
+    for entry in [entry for entry in entries_of(folder) if entry in listed]:
         if not entry.endswith("/"):
             (folder / entry).unlink(missing_ok=True)
         else:

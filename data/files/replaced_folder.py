@@ -14,7 +14,6 @@ from phasemark.data.files.atomic_write import followed, move, storage_errors, sy
 from phasemark.data.files.folder_marker import (
     MARKER,
     entries_of,
-    foreign_entry,
     is_marker_part,
     read_marker,
     remove_listed,
@@ -99,7 +98,8 @@ def refuse_folder(path: Path, *, force: bool) -> None:
         raise UsageError(f"{path}: is a file, give the name of a folder")
     with storage_errors(path):
         marked, listed = read_marker(path)
-        stranger = foreign_entry(path, listed or set()) if marked else None
+        held = entries_of(path) if marked else ()
+        stranger = next((entry for entry in held if entry not in (listed or ())), None)
     if not marked:
         raise OutputExistsError(
             f"{path}: exists and was not written by phasemark, so it is not replaced, even with force=True: give"

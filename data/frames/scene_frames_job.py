@@ -7,7 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,17 +95,18 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
         for index in range(start, stop):  # a generator may change its meshes from scene to scene
             scenes.append(self._source.placed(index))
             shots.append(self._rendered(scenes[-1], index))
-        stored = {"coverage": np.concatenate([np.minimum(shot.shares.sum(axis=-1), 1.0) for shot in shots])}
-        phasors = [shot.phasors for shot in shots if shot.phasors is not None]
-        counts = [shot.histograms for shot in shots if shot.histograms is not None]
+        phasors = [own for own, _, _ in shots if own is not None]
+        counts = [own for _, own, _ in shots if own is not None]
+        shares = [own for _, _, own in shots]
+        stored = {"coverage": np.concatenate([np.minimum(own.sum(axis=-1), 1.0) for own in shares])}
         image: PhasorImages | HistogramImages
         if phasors:
             image = joined_images(phasors, slice(None), self.sensor)
             stored["range_mixed"] = image.range_m
         if counts:
-            expected, signal = (np.concatenate([getattr(part, name) for part in counts]) for name in _COUNTS)
-            image = HistogramImages(expected, signal, self.sensor)
-        stored["shares"] = np.concatenate([self._of_classes(*pair) for pair in zip(scenes, shots, strict=True)])
+            expected = np.concatenate([part.expected for part in counts])
+            image = HistogramImages(expected, np.concatenate([part.signal for part in counts]), self.sensor)
+        stored["shares"] = np.concatenate([self._of_classes(*pair) for pair in zip(scenes, shares, strict=True)])
         if "poses" in self.plan.keep:
             poses = [self._poses(scene) for scene in scenes]
             stored |= {name: np.concatenate([own[name] for own in poses]) for name in POSE_FIELDS}
@@ -113,8 +114,10 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
             stored[f"label_{name}"] = np.concatenate([scene.labels[name] for scene in scenes])
         return stored, image
 
-    def _rendered(self, placed: PlacedScene, index: int) -> _Shot:
-        """Render the steps of a scene."""
+    def _rendered(
+        self, placed: PlacedScene, index: int
+    ) -> tuple[PhasorImages | None, HistogramImages | None, NDArray[np.float64]]:
+        """Render the steps of a scene: phasors, histograms, and the share of each body."""
         scene, cameras, bodies = placed.scene, placed.camera2world, placed.bodies2world
         n, shape = len(cameras), (self.sensor.rows, self.sensor.cols)
         if scene is None:
@@ -129,19 +132,19 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
             raise UsageError(f"scene {index} of the plan cannot be rendered: {error}") from None
         shares = counts.shares if counts is not None else phasors.shares if phasors is not None else None
         assert shares is not None
-        return _Shot(phasors, counts, np.zeros((n, *shape, 0)) if placed.scene is None else shares)
+        return phasors, counts, np.zeros((n, *shape, 0)) if placed.scene is None else shares
 
     def _classes_of(self, placed: PlacedScene) -> list[int]:
         """Return the number of the class of each body."""
         found = [class_of_body(name, self.plan.scenes.classes) for name in placed.scene.names] if placed.scene else []
         return [-1 if number is None else number for number in found]
 
-    def _of_classes(self, placed: PlacedScene, shot: _Shot) -> NDArray[np.float64]:
+    def _of_classes(self, placed: PlacedScene, shares: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the shares of the classes, those of their bodies together, (n, rows, cols, classes)."""
-        out = np.zeros((*shot.shares.shape[:-1], len(self.plan.scenes.classes)))
+        out = np.zeros((*shares.shape[:-1], len(self.plan.scenes.classes)))
         for body, number in enumerate(self._classes_of(placed)):
             if number >= 0:
-                out[..., number] += shot.shares[..., body]
+                out[..., number] += shares[..., body]
         return np.minimum(out, 1.0)
 
     def _poses(self, placed: PlacedScene) -> dict[str, NDArray[Any]]:
@@ -154,16 +157,7 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
         return {"camera2world": placed.camera2world, "bodies2world": bodies, "class_of_body": classes}
 
 
-_COUNTS = ("expected", "signal")
 _BEHIND = np.eye(4) + np.array([[0, 0, 0, -10 * _SPECK_M], [0] * 4, [0] * 4, [0] * 4])
-
-
-class _Shot(NamedTuple):
-    """Renderings of the steps of a scene."""
-
-    phasors: PhasorImages | None
-    histograms: HistogramImages | None
-    shares: NDArray[np.float64]
 
 
 class _Renderers:

@@ -45,9 +45,6 @@ from phasemark.render.view import FARTHEST_M
 
 MOST_LANDMARKS = 256
 """Of a plan: each takes one or two scenes of the intersector, which can hold some hundreds."""
-DEFAULT_DISTANCE_M = "0.7:2.1:0.01"
-DEFAULT_DELTA_STEP_DEG = 1.0
-DEFAULT_MARGIN_DEG = 5.0
 
 _YOUNGER_FIELDS = {
     "lens", "histogram", "lamp_half_angle_deg", "lamp_profile", "bearing_offset_deg", "height_offset_m", "delay_s",
@@ -330,7 +327,7 @@ class BankPlan(ScenePlan):
     (0.8, 1.0, 1.2)
     """
 
-    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(default=DEFAULT_DISTANCE_M, validate_default=True)
+    distance_m: Annotated[_Grid, AfterValidator(_positive)] = Field(default="0.7:2.1:0.01", validate_default=True)
     delta_deg: _Grid | None = None
     model: Literal["ray", "hard", "planar"] = "ray"
     layout: Literal["factored", "full"] = "factored"
@@ -340,7 +337,7 @@ class BankPlan(ScenePlan):
         Literal["whole", "landmark"] | tuple[_Edge, _Edge, _Edge, _Edge], WrapValidator(_named_or_edges)
     ] = "whole"
     binning: Annotated[int, Field(ge=1, le=MOST_BINNING)] = 1
-    margin_deg: Annotated[float, Field(ge=0, le=45)] = DEFAULT_MARGIN_DEG
+    margin_deg: Annotated[float, Field(ge=0, le=45)] = 5.0
 
     @model_serializer(mode="wrap")
     def _without_whole_region(self, dump: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -375,7 +372,7 @@ class BankPlan(ScenePlan):
             meshes = [mesh.model_copy(update={"albedo": self.albedo}) for mesh in meshes]
         meshes = find_symmetries(meshes)
         period_deg = 360 / common_symmetry([*specs, *meshes])
-        delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:{DEFAULT_DELTA_STEP_DEG}", "delta_deg")
+        delta_deg = parse_grid(self.delta_deg or f"0:{period_deg!r}:1", "delta_deg")
         return self._resolved(
             specs, meshes, self.build_sensor(), albedo=None, region=self._resolved_region(specs, meshes),
             delta_deg=tuple(drop_repeated_stop(delta_deg, period_deg).tolist()),
