@@ -200,8 +200,7 @@ def _compare(
         else:
             limit = TOLERANCE * float(np.nanmax(np.abs(old), initial=1e-30))
         wrong = nan_differs | (np.abs(gap) > limit)
-        noisy = name in _NOISY
-        if float(np.mean(wrong)) > (noisy_share if noisy else 0.0):
+        if float(np.mean(wrong)) > (noisy_share if name in _NOISY else 0.0):
             place = np.unravel_index(int(np.argmax(np.abs(gap) + nan_differs)), gap.shape)
             raise InputFileError(
                 f"{path}: '{name}' of item {item} is not what rendering it again gives: {old[place]} at"

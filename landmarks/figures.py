@@ -139,12 +139,11 @@ def mesh_html(mesh: trimesh.Trimesh, title: str) -> str:
     corners = trimesh.graph.smooth_shade(mesh, angle=_CREASE_RAD)
     extents = " × ".join(f"{100 * value:.4g}" for value in mesh.extents)
     page = resources.files("phasemark.landmarks").joinpath("viewer.html").read_text(encoding="utf-8")
-    shown = np.asarray(corners.vertices)
     return string.Template(page).substitute(
         title=html.escape(title),
         facts=f"{extents} cm, {len(mesh.faces)} faces",
         origin=json.dumps((-centre / radius).round(6).tolist()),
-        vertices=_base64((shown - centre) / radius, np.float32),
+        vertices=_base64((np.asarray(corners.vertices) - centre) / radius, np.float32),
         faces=_base64(np.asarray(corners.faces), np.uint32),
         normals=_base64(np.asarray(corners.vertex_normals)[corners.faces], np.float32),
     )
@@ -175,8 +174,7 @@ def _visible_edges(mesh: trimesh.Trimesh, towards: NDArray[np.float64], closed: 
     way = ends[whole, 1] - ends[whole, 0]
     parts = np.stack([ends[whole, 0] + start[:, None] * way, ends[whole, 0] + stop[:, None] * way], axis=1)
     blocking = np.asarray(mesh.triangles)[front] if closed else np.asarray(mesh.triangles)
-    hidden = _hidden(parts.mean(axis=1) + 1e-3 * size * towards, blocking, towards)
-    return np.asarray(parts[~hidden])
+    return np.asarray(parts[~_hidden(parts.mean(axis=1) + 1e-3 * size * towards, blocking, towards)])
 
 
 def _hidden(

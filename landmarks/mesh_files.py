@@ -227,8 +227,7 @@ def export_mesh(mesh: trimesh.Trimesh, file_type: str) -> bytes:
     kind = file_type.lower()
     if kind not in FORMATS:
         raise UsageError(f"unknown mesh format '{file_type}': the formats are {', '.join(FORMATS)}")
-    plain = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    content = plain.export(file_type=kind)
+    content = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).export(file_type=kind)
     return content.encode() if isinstance(content, str) else bytes(content)
 
 

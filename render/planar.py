@@ -264,5 +264,4 @@ def _meet_circles(
     radius = radius_m[..., None]
     met = (np.abs(aside) < radius) & (along > 0)
     half_chord = np.sqrt(np.where(met, radius**2 - aside**2, 0.0))
-    distance = np.where(met, along - half_chord, np.inf)
-    return distance, half_chord / np.where(met, radius, 1.0)
+    return np.where(met, along - half_chord, np.inf), half_chord / np.where(met, radius, 1.0)

@@ -336,8 +336,7 @@ class Renderer:
         views = Views.broadcast(distance_m, delta_rad, bearing_rad, height_m, pitch_rad, roll_rad).in_camera(
             self.sensor
         )
-        behind = self._checked(views, background, workers)
-        return self._differences(views, behind, parameters, workers)
+        return self._differences(views, self._checked(views, background, workers), parameters, workers)
 
     def render_with_slopes(
         self,
@@ -436,8 +435,7 @@ class Renderer:
         m, _, p = by_pixel.shape
         slope = by_pixel.reshape(m, len(seen), self.sensor.rows, self.sensor.cols, p).transpose(1, 4, 0, 2, 3)
         slope = slope[:, :, 0] if m == 1 else slope
-        unknown = np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.split)
-        full = np.flatnonzero(unknown)
+        full = np.flatnonzero(np.isnan(slope).any(axis=tuple(range(1, slope.ndim))) | (not self.topology.split))
         if full.size and p:
             slope[full] = self._differences(seen[full], behind[full], parameters, workers)
         return slope
@@ -527,13 +525,12 @@ class Renderer:
         if behind[:, BOUNCES].any() and variant == "exact":
             self._add_bounces(sums, poses, ordered, rows, workers, slope)
         images = images_of_sums(sums, self.sensor, self._integral.harmonics)
-        upper = np.minimum(sums.shares[:, 1].reshape(sums.state.shape), 1.0)
         return replace(
             images,
             phasor=_restored(images.phasor, order),
             intensity=_restored(images.intensity, order),
             coverage=_restored(images.coverage, order),
-            upper_coverage=_restored(upper, order),
+            upper_coverage=_restored(np.minimum(sums.shares[:, 1].reshape(sums.state.shape), 1.0), order),
             views=views,
             harmonics={k: _restored(values, order) for k, values in images.harmonics.items()},
             by_hz={hz: _restored(values, order) for hz, values in images.by_hz.items()},
@@ -567,8 +564,7 @@ class Renderer:
         from phasemark.render.bounces.standing import standing_light
 
         if self._standing is None or not self._standing.is_of(self.albedo, self.sensor):
-            frequencies = [0.0, *columns_hz]
-            self._standing = standing_light(self.topology, self.albedo, self.sensor, frequencies)
+            self._standing = standing_light(self.topology, self.albedo, self.sensor, [0.0, *columns_hz])
         return self._standing
 
     def _check_lens_outside(self, views: Views) -> None:

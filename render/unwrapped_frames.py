@@ -83,8 +83,7 @@ def unwrapped(
         `std_m` is that of the noise alone.
     """
     offset_m = systematic_phase_std_rad(sensor) * np.array([camera.metres_per_radian for camera in sensor.by_frequency])
-    known = [np.where(np.isfinite(own), std, 1.0) for own, std in zip(range_m, std_m, strict=True)]
-    noise = np.stack(known)
+    noise = np.stack([np.where(np.isfinite(own), std, 1.0) for own, std in zip(range_m, std_m, strict=True)])
     each = (slice(None), *(None,) * (noise.ndim - 1))
     found = unwrap_ranges(np.stack(list(range_m)), np.hypot(noise, offset_m[each]), sensor)
     if not offset_m.any():

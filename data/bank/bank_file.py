@@ -186,11 +186,10 @@ class BankGroup:
         return np.asarray(dataset.asstr()[...] if is_text else dataset[...].astype(np.float64))
 
     def _check_coordinates(self, sensor: Sensor) -> None:
-        rows = group_rows(self.name, sensor)
         wrong = {
             "distance": self.distance_m[0] <= 0 or not _increases(self.distance_m),
             "delta": not _increases(self.delta_rad),
-            "row": not np.array_equal(self.row, np.arange(*rows)),
+            "row": not np.array_equal(self.row, np.arange(*group_rows(self.name, sensor))),
             "col": not np.array_equal(self.col, np.arange(sensor.cols)),
             "frequency": self._lacks_frequencies(sensor),
             "iq": self._group["iq"].shape != (2,),
@@ -338,7 +337,6 @@ class Bank(StoredScene):
         """Return the content of the bank in plain numbers and text."""
         groups = [group for group in (self.lower, self.upper, self.full) if group is not None]
         file = self._open()
-        views = {group.name: int(np.prod(file[group.name]["phasor"].shape[:-4])) for group in groups}
         return {
             "path": str(self.path),
             "size_bytes": int(file.id.get_filesize()),
@@ -350,7 +348,7 @@ class Bank(StoredScene):
             "n_distance": len(self.distance_m),
             "delta_deg": format_grid(self.plan.delta_deg or ()),
             "n_delta": len(self.delta_rad),
-            "images": views,
+            "images": {group.name: int(np.prod(file[group.name]["phasor"].shape[:-4])) for group in groups},
             "sensor": self.plan.sensor,
             "rows": self.sensor.rows,
             "cols": self.sensor.cols,
@@ -363,8 +361,7 @@ class Bank(StoredScene):
     def _kind_info(self, group: BankGroup) -> dict[str, Any]:
         """Return how the camera measures; a direct one has no modulation, and the one in its file is the model's."""
         if self.sensor.kind == "phase":
-            orders = [k for k in group.order.tolist() if k]
-            return {"harmonics": orders, "modulation_hz": self.sensor.modulation_hz}
+            return {"harmonics": [k for k in group.order.tolist() if k], "modulation_hz": self.sensor.modulation_hz}
         histogram = self.sensor.histogram
         names = ("bins", "bin_width_m", "max_targets", "min_separation_m") if histogram is not None else ()
         stated = {name: getattr(self.sensor, name) for name in ("kind", "quantity", "max_range_m")}

@@ -385,8 +385,7 @@ def _images_of(
 
 def _stored(images: PhasorImages) -> dict[str, NDArray[np.float32]]:
     """Return images as the bank's datasets hold them, views first."""
-    orders = sorted(images.harmonics)
-    frequencies = bank_frequencies_hz(images.sensor, orders)
+    frequencies = bank_frequencies_hz(images.sensor, sorted(images.harmonics))
     phasor = np.stack([images.at_frequency(hz) for hz in frequencies], axis=1).astype("<c8")
     stored = {
         "phasor": phasor.view("<f4").reshape(*phasor.shape, 2),

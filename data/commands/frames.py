@@ -193,8 +193,7 @@ def frames_import(
 
     refuse_other_files(out, ".npz", "the output")
     refuse_existing([out], force)
-    frames = reading.read(file, read_sensor(sensor))
-    echo(write_measured(frames, out, force=force))
+    echo(write_measured(reading.read(file, read_sensor(sensor)), out, force=force))
 
 
 def frames_simulate(

@@ -72,8 +72,7 @@ def landmark_export(name: ClassName, *, out: Out, force: Force = False) -> None:
     from phasemark.landmarks import export_mesh
 
     refuse_input_files([out])
-    mesh = class_mesh(name)
-    echo(write_file(out, export_mesh(mesh, out.suffix.removeprefix(".")), force))
+    echo(write_file(out, export_mesh(class_mesh(name), out.suffix.removeprefix(".")), force))
 
 
 def landmark_check(file: Path, *, mesh_reading: MeshReading, as_json: Json = False) -> None:

@@ -53,8 +53,7 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
             features = features or {name: _feature(values) for name, values in columns.items()}
             path = folder / _PATH.format(episode_chunk=number // CHUNK, episode_index=number)
             path.parent.mkdir(parents=True, exist_ok=True)
-            table = arrow.table({name: _column(arrow, values) for name, values in columns.items()})
-            parquet.write_table(table, path)
+            parquet.write_table(arrow.table({name: _column(arrow, values) for name, values in columns.items()}), path)
             _line(listed, {"episode_index": number, "tasks": [task], "length": len(numbers)})
             own = {name: _stats(values) for name, values in columns.items() if values.dtype.kind != "U"}
             _line(stats, {"episode_index": number, "stats": own})

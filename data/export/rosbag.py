@@ -51,14 +51,12 @@ def _write(frames: FrameSet, store: Any, bag: Any) -> None:
             topics[AMPLITUDE_TOPIC] = "sensor_msgs/msg/Image"
         connections = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in topics.items()}
         for topic, time_ns, message in _messages(frames, store):
-            raw = store.serialize_cdr(message, message.__msgtype__)
-            writer.write(connections[topic], time_ns, raw)
+            writer.write(connections[topic], time_ns, store.serialize_cdr(message, message.__msgtype__))
 
 
 def _messages(frames: FrameSet, store: Any) -> Iterator[tuple[str, int, Any]]:
     sensor, types = frames.sensor, store.types
-    to_optical = CAM2OPTICAL @ sensor.cam2level.T
-    static = _transform(types, 0, _CAMERA, _OPTICAL, to_optical.T, np.zeros(3))
+    static = _transform(types, 0, _CAMERA, _OPTICAL, (CAM2OPTICAL @ sensor.cam2level.T).T, np.zeros(3))
     yield "/tf_static", 0, types["tf2_msgs/msg/TFMessage"](transforms=[static])
     cosine = sensor.axis_cosine()
     for start, sample in blocks(frames):

@@ -104,8 +104,7 @@ class Layout:
         creation.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
         creation.set_obj_track_times(False)
         space = h5py.h5s.create_simple(tuple(shape))
-        kind = h5py.h5t.py_create(np.dtype(dtype))
-        dataset = h5py.h5d.create(group.id, name.encode(), kind, space, creation)
+        dataset = h5py.h5d.create(group.id, name.encode(), h5py.h5t.py_create(np.dtype(dtype)), space, creation)
         offset = int(dataset.get_offset())
         self._reserved.append((offset, offset + int(np.prod(shape)) * np.dtype(dtype).itemsize))
         return h5py.Dataset(dataset), offset

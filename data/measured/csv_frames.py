@@ -223,8 +223,7 @@ def _numbers(body: _Text, columns: Sequence[int]) -> NDArray[np.float64]:
     """
     if not body.lines:
         raise InputFileError(f"{body.path}: holds no frames")
-    lines = [line for _, line in body.lines]
-    fast = _fast_numbers(lines, body.separator, body.expected, columns)
+    fast = _fast_numbers([line for _, line in body.lines], body.separator, body.expected, columns)
     return _checked_numbers(body, columns) if fast is None else fast
 
 

@@ -226,8 +226,7 @@ def read_targets(path: str | os.PathLike[str], *, sensor: Sensor, valid_status: 
     if not any(kind == "mm" for kind, *_ in places):
         raise InputFileError(f"{path}: must have columns mm_0_0 … (zone, target), got {', '.join(header[:4])} …")
     most = 1 + max(k for _, _, k in places)
-    shape = (len(lines) - 1, n_zones, most)
-    out = {kind: np.full(shape, np.nan) for kind in ("mm", "sigma_mm", "signal", "status")}
+    out = {kind: np.full((len(lines) - 1, n_zones, most), np.nan) for kind in ("mm", "sigma_mm", "signal", "status")}
     for row, line in enumerate(lines[1:]):
         cells = line.split(",")
         if len(cells) != len(header):

@@ -579,8 +579,7 @@ def _read_hdf5(path: Path, untrusted: bool) -> Recording:
         attributes = {"unit": "units", "quantity": "quantity"}
         stated = {name: _word(main.attrs[key]) for name, key in attributes.items() if key in main.attrs}
         if "format" not in file.attrs:  # a frame set of ours has more, which is documented
-            others = {name for name in file if isinstance(file.get(name), h5py.Dataset)}
-            _note_ignored(others - set(_COLUMNS), path)
+            _note_ignored({name for name in file if isinstance(file.get(name), h5py.Dataset)} - set(_COLUMNS), path)
         return _of_arrays(datasets, datasets, stated, path)
 
 

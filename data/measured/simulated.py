@@ -114,8 +114,7 @@ def simulate_recording(
         taken.append(shot.ranges if reports else shot)
 
     stamps = np.round(np.arange(len(views)) / sensor.frame_rate_hz, 3)[None]
-    frames = _one_after_the_other(taken, stamps)
-    return SimulatedRecording(frames, views, class_name)
+    return SimulatedRecording(_one_after_the_other(taken, stamps), views, class_name)
 
 
 def _one_after_the_other(taken: Sequence[Frames], time_s: NDArray[np.float64] | None = None) -> Frames:
@@ -221,8 +220,7 @@ def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str
     direct = frames.sensor.kind == "direct"
     if direct:
         arrays["range"] = np.round(1e3 * np.nan_to_num(frames.z_m[0])).astype(np.int64)  # 0 where there is no reading
-        missing = (frames.flags[0] & int(Flag.MISSING)) > 0
-        without = np.where(missing, STATUS_NO_UPDATE, STATUS_NO_TARGET)
+        without = np.where((frames.flags[0] & int(Flag.MISSING)) > 0, STATUS_NO_UPDATE, STATUS_NO_TARGET)
         arrays["status"] = np.where(frames.valid[0], STATUS_VALID, without)
     else:
         arrays["range"], arrays["valid"] = frames.range_m[0], frames.valid[0]

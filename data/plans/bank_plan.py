@@ -389,8 +389,7 @@ class BankPlan(ScenePlan):
             region = whole_region(sensor, self.binning)
         elif self.region == "landmark":
             shapes = [*map(build_mesh, specs), *(part.read() for part in meshes)]
-            margin_rad = math.radians(self.margin_deg)
-            region = landmark_region(sensor, shapes, self.distance_m, self.binning, margin_rad)
+            region = landmark_region(sensor, shapes, self.distance_m, self.binning, math.radians(self.margin_deg))
         else:
             region = Region(*self.region, self.binning)
         region.check(sensor)

@@ -195,8 +195,7 @@ def _uniform(seed: int, purpose: str, start: int, stop: int) -> NDArray[np.float
     rng = stream(seed, f"frames.{purpose}", 0)
     skipped, offset = divmod(start, 4)  # Philox counts blocks of four numbers
     rng.bit_generator.advance(skipped)  # type: ignore[attr-defined]
-    raw = rng.random(stop - start + offset)[offset:]
-    return np.maximum(raw, 2.0**-54)
+    return np.maximum(rng.random(stop - start + offset)[offset:], 2.0**-54)
 
 
 TILT = ("pitch_deg", "roll_deg")
@@ -381,8 +380,7 @@ class FramePlan(ScenePlan):
                 truth[name] = np.full(stop - start, spread.fixed)
             else:
                 truth[name] = spread.values(_uniform(self.seed, name, start, stop))
-        split = split_of_views(self.seed, self.splits, start, stop)
-        truth["split_index"] = narrowed(split, "|u1", "splits")
+        truth["split_index"] = narrowed(split_of_views(self.seed, self.splits, start, stop), "|u1", "splits")
         return truth
 
     def _sobol(self, start: int, stop: int) -> dict[str, NDArray[np.float64]]:

@@ -158,8 +158,7 @@ def generated(
     try:
         found: Any = generator(index, rng, **options)
     except (Exception, SystemExit) as error:
-        repeat = f"{where} (plan.generate({index}) repeats it)"
-        raise called_program(f"the generator '{name}'", error, repeat) from None
+        raise called_program(f"the generator '{name}'", error, f"{where} (plan.generate({index}) repeats it)") from None
     if not isinstance(found, GeneratedScene):
         what = "None" if found is None else f"an object of type {type(found).__name__}"
         raise UsageError(f"{where}: the generator '{name}' must return a GeneratedScene, got {what}")
@@ -184,7 +183,6 @@ def placed(found: GeneratedScene, index: int, steps: int, labels: Mapping[str, s
     UsageError
         A pose is not rigid, there are other numbers of them than steps, or labels have other names or kinds.
     """
-    where = f"scene {index}"
     try:
         if found.scene is not None and not isinstance(found.scene, Scene):
             raise UsageError(f"'scene' must be a Scene or None, got {type(found.scene).__name__}")
@@ -201,7 +199,7 @@ def placed(found: GeneratedScene, index: int, steps: int, labels: Mapping[str, s
         if labels is not None:
             _check_labels(own, labels)
     except PhasemarkError as error:
-        raise UsageError(f"{where}: {error}") from None
+        raise UsageError(f"scene {index}: {error}") from None
     return PlacedScene(found.scene, cameras, bodies, own, found.background)
 
 

@@ -253,8 +253,7 @@ class SceneFramesPlan(SensorPlan):
         if scenes.labels is None or scenes.source_sha256 is None:
             source = self.source()
             labels = {name: kind_of_label(values) for name, values in source.placed(0).labels.items()}
-            stated = {"n": self.n_scenes, "labels": labels, "source_sha256": source.sha256}
-            scenes = scenes.model_copy(update=stated)
+            scenes = scenes.model_copy(update={"n": self.n_scenes, "labels": labels, "source_sha256": source.sha256})
         no_table = sensor.histogram is None
         absent = {"histograms": no_table, "targets": no_table, "shares": not scenes.classes}
         return self.model_copy(

@@ -77,8 +77,7 @@ def board_image(sensor: Sensor, distance_m: float, albedo: float) -> PhasorImage
     if not 0 < albedo <= 1:
         raise UsageError(f"'albedo' must be in (0, 1], got {albedo:g}")
     level = sensor.with_(pitch_deg=0.0, roll_deg=0.0, bearing_offset_deg=0.0, height_offset_m=0.0)
-    board = Background(wall_m=distance_m, wall_albedo=albedo)
-    return Renderer(None, level).render(distance_m / 2, background=board)
+    return Renderer(None, level).render(distance_m / 2, background=Background(wall_m=distance_m, wall_albedo=albedo))
 
 
 @dataclass(frozen=True, eq=False)

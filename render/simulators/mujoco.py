@@ -320,8 +320,7 @@ class TofSensor:
         except UsageError as error:
             raise UsageError(f"{str(error).removeprefix('in frame 0 ')}; exclude_body=… leaves one out") from None
         assert images.shares is not None
-        shares = images.shares[0] @ self._of_body
-        truth = TofTruth(self._centre_z(data, camera2world), shares, self.bodies)
+        truth = TofTruth(self._centre_z(data, camera2world), images.shares[0] @ self._of_body, self.bodies)
         return {number: self._reading(images, float(data.time), number, truth) for number in numbers}
 
     def _reading(

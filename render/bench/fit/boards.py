@@ -130,8 +130,7 @@ class BoardData:
     @property
     def variance_m2(self) -> Floats:
         """Variance of the range in one frame, NaN where too few frames are valid, (boards, rows, cols)."""
-        variance = np.array([one.variance for one in self.error_m])
-        return np.where(self.n >= FEWEST_FRAMES / 2, variance, np.nan)
+        return np.where(self.n >= FEWEST_FRAMES / 2, np.array([one.variance for one in self.error_m]), np.nan)
 
     @property
     def mean_variance_m2(self) -> Floats:
