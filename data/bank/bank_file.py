@@ -100,11 +100,8 @@ class BankGroup:
             Along the first axes of the views. The grids and classes stay those of the whole group.
         """
         some: BankGroup = object.__new__(type(self))
-        some.__dict__.update({name: value for name, value in vars(self).items() if name not in _IMAGES})
-        some._which = which
-        for name in _IMAGES:
-            if name in vars(self):
-                some.__dict__[name] = vars(self)[name][which]
+        held = {name: value[which] if name in _IMAGES else value for name, value in vars(self).items()}
+        some.__dict__.update(held, _which=which)
         return some
 
     def parts(self) -> Iterator[tuple[tuple[slice, ...], BankGroup]]:

@@ -149,9 +149,7 @@ def of_any_albedo(behind: Background | None) -> Background | None:
     """Return a background whose albedos nobody states; one off which light bounces as it is."""
     from phasemark.render.background import UNSTATED_ALBEDO_STD
 
-    if behind is None or behind.bounces:
-        return behind
-    return replace(behind, albedo_ratio_std=UNSTATED_ALBEDO_STD)
+    return behind if behind is None or behind.bounces else replace(behind, albedo_ratio_std=UNSTATED_ALBEDO_STD)
 
 
 def background_to_estimate(

@@ -70,8 +70,7 @@ def write_ply(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
             seen = np.isfinite(range_m).ravel()
             points = np.empty(int(seen.sum()), dtype=fields)
             xyz = directions[seen] * range_m.ravel()[seen, None].astype(float)
-            for axis, name in enumerate("xyz"):
-                points[name] = xyz[:, axis]
+            points["x"], points["y"], points["z"] = xyz.T
             points["range"], points["amplitude"] = range_m.ravel()[seen], amplitude_e.ravel()[seen]
             points["row"], points["col"] = rows[seen], cols[seen]
             header = [

@@ -47,9 +47,7 @@ def write_npz(frames: FrameSet, path: Path, quantity: RangeOrZ, content: str | N
 def _range_columns(frames: FrameSet, sample: Sample, quantity: RangeOrZ) -> dict[str, Any]:
     """Return ranges and what belongs to them of a block."""
     columns: dict[str, Any] = {"range": quantity_m(frames, sample, quantity).astype(np.float32)}
-    for name in ("amplitude", "intensity"):
-        if f"{name}_e" in sample:
-            columns[name] = sample[f"{name}_e"]
+    columns |= {name: sample[f"{name}_e"] for name in ("amplitude", "intensity") if f"{name}_e" in sample}
     for name in (key for key in sample if key.startswith("frequency_")):
         columns[name.removesuffix("_m").removesuffix("_e")] = sample[name]
     columns["flags"] = sample["flags"]

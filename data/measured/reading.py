@@ -383,9 +383,8 @@ def write_measured(frames: Frames, path: str | os.PathLike[str], *, force: bool 
     arrays: dict[str, Any] = {"range": frames.range_m, "valid": frames.valid, "flags": frames.flags}
     if len(frames.by_frequency) > 1:  # each frequency has NaN where it has no range
         del arrays["valid"]
-    for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
-        if values is not None:
-            arrays[name] = values
+    measured = {"amplitude": frames.amplitude_e, "intensity": frames.intensity_e}
+    arrays |= {name: values for name, values in measured.items() if values is not None}
     if len(frames.sensor.frequencies_hz) > 1:
         arrays["frequency"] = np.array(frames.sensor.frequencies_hz)
         for key, attribute in zip(_OF_FREQUENCY, ("range_m", "amplitude_e", "intensity_e"), strict=True):

@@ -224,9 +224,8 @@ def _arrays(recording: SimulatedRecording) -> tuple[dict[str, NDArray[Any]], str
         arrays["status"] = np.where(frames.valid[0], STATUS_VALID, without)
     else:
         arrays["range"], arrays["valid"] = frames.range_m[0], frames.valid[0]
-        for name, values in (("amplitude", frames.amplitude_e), ("intensity", frames.intensity_e)):
-            if values is not None:
-                arrays[name] = values[0]
+        measured = {"amplitude": frames.amplitude_e, "intensity": frames.intensity_e}
+        arrays |= {name: values[0] for name, values in measured.items() if values is not None}
     arrays |= {**_truth(recording.views), "truth_class": np.array(recording.class_name)}
     return arrays, "mm" if direct else "m", "z" if direct else "range"
 

@@ -397,9 +397,7 @@ class BankPlan(ScenePlan):
 
     def pixel_region(self) -> Region | None:
         """Return which pixels of the camera the images of a resolved plan hold; None: every one."""
-        if isinstance(self.region, str):
-            return None
-        return Region(*self.region, self.binning)
+        return None if isinstance(self.region, str) else Region(*self.region, self.binning)
 
     def image_sensor(self) -> Sensor:
         """Return the camera that sees the images of a resolved plan: the sensor, read in its region."""
