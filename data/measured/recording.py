@@ -23,6 +23,9 @@ SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
 """Names of time stamps, in CSV columns and in arrays, with the length of their unit."""
 TILTS = ("pitch_deg", "roll_deg")
 """Names of the tilt of each frame, in CSV columns and in arrays."""
+_NEAREST_M = 0.01
+"""No sensor reads less in all pixels."""
+METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 @dataclass(frozen=True)
@@ -153,11 +156,6 @@ class Orientation:
 
 ORIENTATIONS = tuple(Orientation(flip_h, rotate) for flip_h in (False, True) for rotate in (0, 90, 180, 270))
 """All of a square grid; one that is not square has those of 0° and 180°."""
-
-
-_NEAREST_M = 0.01
-"""No sensor reads less in all pixels."""
-METRES_PER_UNIT: dict[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
 def _range_limit(sensor: Sensor) -> tuple[float, str]:
