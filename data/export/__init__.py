@@ -15,7 +15,7 @@ from phasemark.data.export.lerobot import write_lerobot
 from phasemark.data.export.rosbag import write_rosbag
 from phasemark.data.export.tables import write_csv, write_jsonl, write_npz, write_targets_csv
 from phasemark.data.export.webdataset import write_webdataset
-from phasemark.data.files.atomic_write import replacing
+from phasemark.data.files.atomic_write import refuse_unwritable, replacing
 from phasemark.data.files.replaced_folder import replacing_folder
 from phasemark.data.files.same_file import refuse_inputs
 from phasemark.data.frames.frame_set_file import FrameSet, SceneFrameSet
@@ -125,6 +125,7 @@ def export_frames(
         with replacing_folder(path, f"frames export --to {to}", force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     else:
+        refuse_unwritable(path, force=force)  # a link too, which the writer would follow
         with replacing(path, force=force) as temporary:
             write(frames, temporary, quantity or quantities[0])
     return path
