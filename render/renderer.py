@@ -444,13 +444,11 @@ class Renderer:
         self, seen: Views, background: NDArray[np.float64], parameters: Sequence[str], workers: int
     ) -> NDArray[np.complex128]:
         """Return slopes as differences of images; `seen` as the camera itself has the views."""
-        # a step may take a landmark that stands on the floor a hair into it
-        whole = (0, self.sensor.rows)
-        one = len(self.sensor.frequencies_hz) == 1
 
+        # not checked: a step may take a landmark that stands on the floor a hair into it
         def phasor_of(moved: Views, which: slice | NDArray[np.integer]) -> NDArray[np.complex128]:
-            images = self._render(moved, background[which], whole, workers)
-            return images.phasor if one else images.phasors
+            images = self._render(moved, background[which], (0, self.sensor.rows), workers)
+            return images.phasor if len(self.sensor.frequencies_hz) == 1 else images.phasors
 
         return differentiate(phasor_of, seen, parameters)
 

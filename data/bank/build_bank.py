@@ -173,9 +173,8 @@ def _key(plan: BankPlan) -> str:
 def _prune(newest: Path) -> None:
     """Throw away the banks that were not used for longest, until the others are small enough."""
     with suppress(OSError):
-        kept = sorted(newest.parent.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True)
         total = 0
-        for path in kept:
+        for path in sorted(newest.parent.glob("*.h5"), key=lambda path: path.stat().st_mtime, reverse=True):
             total += path.stat().st_size
             if total > _MOST_BYTES and path != newest:
                 path.unlink()

@@ -54,9 +54,8 @@ def write_bop(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
         z_m = quantity_m(frames, sample, quantity)
         for k in range(len(z_m)):
             split = frames.splits[int(sample["split_index"][k])]
-            number = counts[split]
+            scene, image = divmod(counts[split], IMAGES_PER_SCENE)
             counts[split] += 1
-            scene, image = divmod(number, IMAGES_PER_SCENE)
             if image == 0:
                 if split in scenes:
                     scenes[split].finish()

@@ -86,10 +86,9 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
 
 def _episodes(frames: FrameSet) -> Iterator[tuple[str, NDArray[np.int64]]]:
     """Yield split and frames of each episode; those of a split follow one another, as ranges of episodes name them."""
-    per = frames.plan.frames_per_view
     steps = frames.plan.scenes.steps if isinstance(frames, SceneFrameSet) else 1
     for split in frames.splits:
-        scenes = frames.split(split).reshape(-1, steps, per)
+        scenes = frames.split(split).reshape(-1, steps, frames.plan.frames_per_view)
         episodes = scenes.swapaxes(1, 2).reshape(-1, steps) if isinstance(frames, SceneFrameSet) else scenes[:, 0]
         for numbers in episodes:
             yield split, numbers

@@ -16,7 +16,7 @@ from trimesh.caching import TrackedArray
 from phasemark import UsageError
 from phasemark.data.frames.frame_set_file import SceneFrameSet
 from phasemark.data.frames.frames_job import Column, FramesJob, joined_images
-from phasemark.data.plans.arrays import POSE_FIELDS, SEQUENCE, refuse_too_many, sizes_of_scenes
+from phasemark.data.plans.arrays import POSE_FIELDS, SEQUENCE, refuse_too_many
 from phasemark.data.plans.generated_scene import PlacedScene, class_of_body
 from phasemark.data.plans.scene_frames_plan import SceneFramesPlan, SceneSource
 from phasemark.render import Body, PhasorImages, Scene, SceneRenderer, Sensor
@@ -81,11 +81,10 @@ class SceneFramesJob(FramesJob[SceneFramesPlan]):
     def coordinates(self) -> Iterator[tuple[str, Any, str, str]]:
         """Yield name, values, unit and long name of each dimension."""
         yield from super().coordinates()
-        sizes = sizes_of_scenes(self.plan)
         if "shares" in self.plan.keep:
             yield "body_class", [*self.plan.scenes.classes], "", "class of bodies"
         if "poses" in self.plan.keep:
-            yield "body", np.arange(sizes["body"], dtype="<i4"), "1", "body of a scene"
+            yield "body", np.arange(self.plan.scenes.bodies, dtype="<i4"), "1", "body of a scene"
             for name, what in (("pose_row", "row"), ("pose_col", "column")):
                 yield name, np.arange(4, dtype="<i4"), "1", f"{what} of a pose"
 

@@ -131,9 +131,8 @@ def found_probability(counts: Floats, sensor: Sensor, range_m: float) -> float:
     sensor : Sensor
     range_m : float
     """
-    histogram = histogram_of(sensor)
     level = float(np.median(stats.poisson.ppf(0.5, counts)))
-    least = level + histogram.threshold * math.sqrt(max(level, 1.0))
+    least = level + histogram_of(sensor).threshold * math.sqrt(max(level, 1.0))
     edges = bin_edges_m(sensor, 0)
     near = np.abs(0.5 * (edges[1:] + edges[:-1]) - range_m) < _REACH * response_std_m(sensor)
     return 1 - float(np.prod(stats.poisson.cdf(np.floor(least), counts[near])))

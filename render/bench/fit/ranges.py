@@ -177,9 +177,8 @@ def bowl(data: BoardData) -> tuple[float, float]:
 
     It is 0 of a board; −1 where z is taken for range, and 1 where range is taken for z.
     """
-    cosine = data.sensor.axis_cosine()[data.good]
     error = data.used([one.mean for one in data.error_m])
-    rise = data.distance_m[:, None] * (1 / cosine - 1)
+    rise = data.distance_m[:, None] * (1 / data.sensor.axis_cosine()[data.good] - 1)
     error, rise = (values - values.mean(axis=1, keepdims=True) for values in (error, rise))
     least = np.finfo(float).tiny
     slope = float((rise * error).sum() / max((rise**2).sum(), least))
