@@ -65,7 +65,8 @@ def explain(
     legend: Literal["best", "upper left", "lower right"] | None = None,
 ) -> None:
     """Give a panel its labels, title, grid, and a legend at a place that matplotlib knows."""
-    panel.set(xlabel=x, ylabel=y)
+    panel.set_xlabel(x)
+    panel.set_ylabel(y)
     if title is not None:
         panel.set_title(title, fontsize=9)
     if grid is not None:
