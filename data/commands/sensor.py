@@ -78,12 +78,7 @@ def sensor_show(
 
     sensor, sources = read_sensor(name_or_file), read_sensor_sources(name_or_file)
     if picture is not None:
-        from phasemark.render.figures import pixel_grid_figure
-
-        if picture.suffix != ".png":
-            raise UsageError(f"--picture must end in .png, got '{picture}'")
-        refuse_existing([picture], force)
-        write_figure(picture, pixel_grid_figure(sensor), force)
+        _write_picture(sensor, picture, force)
     if as_json:
         return echo_json({"name": name_or_file, **sensor.as_dict(), "sources": sources})
     if sensor.kind == "direct":
@@ -147,6 +142,16 @@ def _echo_group(title: str, fields: Mapping[str, object], model: type[BaseModel]
     listed = f"{named}: {', '.join(rest)}" if rest else ""
     echo("" if named != "at their defaults" else f"\n{title}", *shown)
     echo(*(f"# {line}" for line in textwrap.wrap(listed, 118)))
+
+
+def _write_picture(sensor: Sensor, picture: Path, force: bool) -> None:
+    """Write the picture of a sensor's pixel grid."""
+    from phasemark.render.figures import pixel_grid_figure
+
+    if picture.suffix != ".png":
+        raise UsageError(f"--picture must end in .png, got '{picture}'")
+    refuse_existing([picture], force)
+    write_figure(picture, pixel_grid_figure(sensor), force)
 
 
 def sensor_import(
