@@ -61,6 +61,8 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
     with (meta / "tasks.jsonl").open("w", encoding="utf-8") as tasks:
         _line(tasks, {"task_index": 0, "task": task})
     rate = float(frames.sensor.frame_rate_hz)
+    of_episode = [split for split, _ in episodes]
+    first_of = {split: of_episode.index(split) for split in dict.fromkeys(of_episode)}
     info = {
         "codebase_version": VERSION,
         "robot_type": None,
@@ -71,7 +73,7 @@ def write_lerobot(frames: FrameSet, folder: Path, quantity: RangeOrZ) -> None:
         "total_chunks": -(-len(episodes) // CHUNK),
         "chunks_size": CHUNK,
         "fps": int(rate) if rate.is_integer() else rate,
-        "splits": _splits([split for split, _ in episodes]),
+        "splits": {split: f"{k}:{k + of_episode.count(split)}" for split, k in first_of.items()},
         "data_path": _PATH,
         "video_path": None,
         "features": features,
@@ -92,14 +94,6 @@ def _episodes(frames: FrameSet) -> Iterator[tuple[str, NDArray[np.int64]]]:
         episodes = scenes.swapaxes(1, 2).reshape(-1, steps) if isinstance(frames, SceneFrameSet) else scenes[:, 0]
         for numbers in episodes:
             yield split, numbers
-
-
-def _splits(of_episode: list[str]) -> dict[str, str]:
-    """Return the range of the episodes of each split."""
-    return {
-        split: f"{of_episode.index(split)}:{of_episode.index(split) + of_episode.count(split)}"
-        for split in dict.fromkeys(of_episode)
-    }
 
 
 def _columns(frames: FrameSet, sample: Sample, episode: int, first: int) -> dict[str, NDArray[Any]]:
