@@ -9,38 +9,36 @@ from types import MappingProxyType
 from typing import Any, Literal, cast
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
-from phasemark.matcher.direct_method import (
-    DIRECT_KINDS,
-    Measured,
-    direct_frames,
-    direct_method,
-    refuse_direct_options,
-    with_direct_errors,
-)
-from phasemark.matcher.estimate.acceptance import with_parts
+from phasemark.matcher.estimate.acceptance import Rules, with_parts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
 from phasemark.matcher.frequencies import OneFrequencyBank
+from phasemark.matcher.histograms.direct_matcher import check_histogram_sensor, refuse_other_sensor
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.scene_models import relative_poses
 from phasemark.matcher.histograms.target_matcher import TargetMatcher
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher
+from phasemark.matcher.likelihood.likelihood_matcher import LikelihoodMatcher, usual_workers
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
 from phasemark.matcher.likelihood.setup import BEARING_STD_RAD, TILT_STD_RAD, Pixels, check_free, setup_of
-from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors, check_systematic
+from phasemark.matcher.likelihood.shared_errors import with_motion
+from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors, check_systematic, declared_covariance
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.one_frequency import OneFrequency
-from phasemark.render import Background, Frames, Renderer
+from phasemark.render import Background, Frames, Renderer, Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
 
 METHODS = ("nearest", "refine")
+Measured = Literal["ranges", "reported", "phasors", "histograms", "targets"]
+"""What is matched on."""
+DIRECT_KINDS = ("histograms", "targets")
+"""What of it a direct sensor alone measures."""
 _LEAST = 1e-9
 """Least standard deviation or tolerance, metres or radians: the square of a smaller one is lost in rounding."""
 
@@ -209,13 +207,19 @@ class Matcher:
         self._direct: HistogramMatcher | TargetMatcher | None = None
         self.free: tuple[str, ...] = VIEW[:2]
         if on in DIRECT_KINDS:
-            refuse_direct_options(method, on, background, pixels, robust, systematic or (), policy is not None)
-            behind = cast(Background | Literal["auto"] | None, background)
+            _refuse_direct_options(method, on, background, pixels, robust, systematic or (), policy is not None)
             known = {"height_m": height_std_m, "pitch_rad": pitch_std_rad, "roll_rad": roll_std_rad}
             if free is None:
                 known["bearing_rad"] = bearing_std_rad or BEARING_STD_RAD
             self.free = VIEW[:3] if free is None else check_free(free)
-            self._direct = direct_method(bank, on, background=behind, free=free, known=known, workers=workers, **limits)
+            check_histogram_sensor(bank)
+            common: dict[str, Any] = {
+                "prior_std": [known.get(name, math.inf) for name in self.free],
+                "rules": Rules.of_bank(bank, self.free, **limits),
+                "background": background,
+                "workers": workers or usual_workers(),
+            }
+            self._direct = HistogramMatcher(bank, **common) if on == "histograms" else TargetMatcher(bank, **common)
             return
         if len(bank.sensor.frequencies_hz) > 1:
             # mixed pixels have no range that the frequencies agree on, and before a background they are at every edge
@@ -397,17 +401,42 @@ class Matcher:
             raise UsageError(
                 "'background' must have no wall in match_jointly, for its distance changes with the pose: give \"auto\""
             )
-        measured = cast(HistogramFrames, direct_frames(self.bank, "histograms", frames))
+        measured = cast(HistogramFrames, self._direct_frames(frames))
         found = self._direct.match_jointly(measured, relative_poses(len(measured), camera2world))
-        return with_direct_errors(self._direct.rules, self._systematic, frames.sensor, None, [found])[0]
+        return self._with_direct_errors(self._direct.rules, frames.sensor, None, [found])[0]
 
     def _matched_directly(self, method: HistogramMatcher | TargetMatcher, frames: object) -> list[Match]:
         """Return answers for histograms or targets, with what all frames of the sensor share."""
-        found = method.match(direct_frames(self.bank, self.options["on"], frames))  # type: ignore[arg-type]
+        found = method.match(self._direct_frames(frames))  # type: ignore[arg-type]
         sensor, time_s = self.bank.camera, None
         if isinstance(frames, HistogramFrames):
             sensor, time_s = frames.sensor, frames.time_s
-        return with_direct_errors(method.rules, self._systematic, sensor, time_s, found)
+        return self._with_direct_errors(method.rules, sensor, time_s, found)
+
+    def _direct_frames(self, frames: object) -> HistogramFrames | Targets:
+        """Return frames as histograms or targets are matched; refuse what is not matched on."""
+        on = self.options["on"]
+        if isinstance(frames, HistogramFrames):
+            refuse_other_sensor(self.bank.camera, frames.sensor)
+            return frames.targets if on == "targets" else frames
+        if on == "targets" and isinstance(frames, Targets):
+            return frames
+        takes = "HistogramFrames" if on == "histograms" else "Targets, or HistogramFrames"
+        raise UsageError(f'on="{on}" takes {takes}, got {type(frames).__name__}')
+
+    def _with_direct_errors(
+        self, rules: Rules, sensor: Sensor, time_s: NDArray[np.float64] | None, answers: list[Match]
+    ) -> list[Match]:
+        """Return answers whose covariances hold what the sensor declares and what the jitter of stamps makes of motion.
+
+        They are refused as "undetermined" where they no longer are within the tolerance.
+        """
+        declared = declared_covariance(sensor, rules.free)
+        if "declared" in self._systematic and declared.any():
+            answers = [with_parts(rules, match, {"declared": declared}) for match in answers]
+        if "motion" not in self._systematic or time_s is None:
+            return answers
+        return with_motion(rules.free, sensor.systematic_time_s, time_s.mean(axis=1), answers)
 
     def _stages(self, arguments: dict[str, Any]) -> list[Matcher]:
         """Return the matchers whose backgrounds are tried in turn: each takes less for known than the one before."""
@@ -487,3 +516,34 @@ def _check_word(name: str, value: object, words: tuple[str, ...], before: str = 
     if not isinstance(value, str) or value not in words:
         shown = repr(value) if isinstance(value, str) else type(value).__name__
         raise UsageError(f"'{name}' must be {before}{' or '.join(map(repr, words))}, got {shown}")
+
+
+def _refuse_direct_options(
+    method: str, on: str, background: Background | Literal["auto", "unknown", "any"] | None, pixels: str, robust: bool,
+    systematic: Collection[str], policy: bool,
+) -> None:  # fmt: skip
+    """Refuse options that do not go with histograms and targets.
+
+    `systematic` was asked for, `policy` says whether one was.
+
+    Raises
+    ------
+    UsageError
+        Naming the option.
+    """
+    wrong = {
+        "'method' must be refine": method != "refine",
+        "'background' must be a Background, 'auto' or None": background in ("unknown", "any"),
+        "'background' must be a Background or None, for targets do not tell it": on == "targets"
+        and background == "auto",
+        "'pixels' must be all": pixels != "all",
+        "'robust' must be False": robust,
+        **{
+            f"'systematic' must be without '{term}', which is carried into ranges and phasors alone": term in systematic
+            for term in ("calibration", "recording")
+        },
+        "'policy' must be None, for it steers the search in ranges and phasors alone": policy,
+    }
+    for problem, is_wrong in wrong.items():
+        if is_wrong:
+            raise UsageError(f'on="{on}": {problem}')

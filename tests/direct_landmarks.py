@@ -14,7 +14,7 @@ from scipy.stats import binom, chi2
 from phasemark.data import Bank, BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, cramer_rao
-from phasemark.matcher.direct_method import Measured
+from phasemark.matcher.matcher import Measured
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Sensor, Views, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, capture_histograms

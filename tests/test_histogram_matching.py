@@ -30,13 +30,13 @@ from phasemark.data import BankPlan, build_bank
 from phasemark.data.plans import MeshPlan
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, Matches, SearchPolicy, cramer_rao, kalman_filter
-from phasemark.matcher.direct_method import Measured
 from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.cost_shape import axes_of_parameters, lessened, points_along, principal_axes
 from phasemark.matcher.histograms.histogram_matcher import HistogramMatcher
 from phasemark.matcher.histograms.poisson_fit import deviance_moments, deviance_test, frame_sums, moments_of
 from phasemark.matcher.histograms.target_matcher import TargetMatcher, _Fit
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
+from phasemark.matcher.matcher import Measured
 from phasemark.matcher.statistics import nees, view_errors
 from phasemark.render import Background, Frames, Views, capture, preset
 from phasemark.render.direct import HistogramFrames, HistogramRenderer, Targets, capture_histograms
