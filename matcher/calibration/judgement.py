@@ -304,20 +304,13 @@ def _posed(problem: Problem, x: float = 1.0, y: float = 1.0, heading: float = 1.
     return replace(problem, poses=replace(poses, delta_rad=azimuth, bearing_rad=bearing))
 
 
-def _polar(problem: Problem, delta: float = 1.0, bearing: float = 1.0) -> Problem:
-    """Return a problem with δ and bearings of its poses multiplied, each as the camera sees it."""
-    poses = problem.poses
-    return replace(
-        problem, poses=replace(poses, delta_rad=delta * poses.delta_rad, bearing_rad=bearing * poses.bearing_rad)
-    )
-
-
-def _tilted(problem: Problem, pitch: float = 1.0, roll: float = 1.0) -> Problem:
-    """Return a problem with the tilts of its poses multiplied."""
-    poses = problem.poses
-    tilts = {name: by * getattr(poses, name) for name, by in (("pitch_rad", pitch), ("roll_rad", roll))}
+def _multiplied(problem: Problem, **factors: float) -> Problem:
+    """Return a problem with angles of its poses multiplied, by name; tilts stay within those that poses may have."""
+    angles = {name: factor * getattr(problem.poses, name) for name, factor in factors.items()}
     most = math.radians(MOST_TILT_DEG)
-    return replace(problem, poses=replace(poses, **{name: np.clip(own, -most, most) for name, own in tilts.items()}))
+    for name in angles.keys() & {"pitch_rad", "roll_rad"}:
+        angles[name] = np.clip(angles[name], -most, most)
+    return replace(problem, poses=replace(problem.poses, **angles))
 
 
 def _mirrored(stated: Problem) -> _Changes:
@@ -328,8 +321,8 @@ def _mirrored(stated: Problem) -> _Changes:
         (partial(_posed, y=-1), "y of the poses, or δ, likely has the other sign"),
         (partial(_posed, x=-1), "x of the poses likely has the other sign: x_m is that of the lens"),
         (partial(_posed, x=-1, y=-1), "x and y of the poses likely have the other sign: they are those of the lens"),
-        (partial(_polar, delta=-1), "δ of the poses likely has the other sign"),
-        (partial(_polar, bearing=-1), "bearings of the poses likely have the other sign"),
+        (partial(_multiplied, delta_rad=-1), "δ of the poses likely has the other sign"),
+        (partial(_multiplied, bearing_rad=-1), "bearings of the poses likely have the other sign"),
         (partial(_flipped, axes=(-1,)), "images are likely mirrored: give flip_h=True"),
         (partial(_flipped, axes=(-2,)), "images are likely upside down: give flip_v=True"),
         (partial(_flipped, axes=(-2, -1)), "images are likely turned over: give rotate=180"),
@@ -346,10 +339,10 @@ def _alternatives(stated: Problem) -> _Changes:
     if any(one.poses.are_tilted for one in stated.recordings):
         sign = "of the poses likely has the other sign: a positive"
         changes += [
-            (partial(_tilted, pitch=-1), f"pitch {sign} one looks down"),
-            (partial(_tilted, roll=-1), f"roll {sign} one lowers the right side"),
+            (partial(_multiplied, pitch_rad=-1), f"pitch {sign} one looks down"),
+            (partial(_multiplied, roll_rad=-1), f"roll {sign} one lowers the right side"),
             (
-                partial(_tilted, pitch=math.degrees(1), roll=math.degrees(1)),
+                partial(_multiplied, pitch_rad=math.degrees(1), roll_rad=math.degrees(1)),
                 "tilts of the poses are likely radians: pitch_deg and roll_deg are degrees",
             ),
         ]

@@ -107,20 +107,9 @@ class Problem:
 
     def model(self) -> CalibrationModel:
         """Return the model of the frames under any mounting."""
-        return CalibrationModel(
-            self.mesh,
-            self.sensor,
-            self.poses,
-            albedo=self.assumed.albedo,
-            background=self.background,
-            reports_z=self.reports_z,
-            workers=self.workers,
-            rendered=self.rendered,
-            track=self.track,
-            stamp_s=self.frames.time_s,
-            one=self.one,
-            chip=self.chip,
-        )
+        shared = ("mesh", "sensor", "poses", "background", "reports_z", "workers", "rendered", "track", "one", "chip")
+        own = {name: getattr(self, name) for name in shared}
+        return CalibrationModel(**own, albedo=self.assumed.albedo, stamp_s=self.frames.time_s)
 
     def poses_with(self, delay_s: float) -> KnownPoses:
         """Return the poses of the frames of this recording; those of a moving camera at their stamps plus a delay."""
