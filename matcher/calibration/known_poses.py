@@ -273,12 +273,9 @@ def read_poses(
         bearing_rad = np.radians(values.get("bearing_deg", 0.0))
         poses = KnownPoses.polar(values["distance_m"], np.radians(values["delta_deg"]), bearing_rad)
     else:
+        heading_rad = np.radians(values["heading_deg"])
         poses = KnownPoses.cartesian(
-            values["x_m"],
-            values["y_m"],
-            np.radians(values["heading_deg"]),
-            landmark_xy_m=landmark_xy_m,
-            landmark_yaw_rad=landmark_yaw_rad,
+            values["x_m"], values["y_m"], heading_rad, landmark_xy_m=landmark_xy_m, landmark_yaw_rad=landmark_yaw_rad
         )
     none = np.zeros(len(table))
     try:

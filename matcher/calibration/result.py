@@ -218,7 +218,7 @@ class Calibration(Fitted):
         for name, use in USES.items():
             if name in self.free:
                 unit = f" {PARAMETERS[name].unit}" if PARAMETERS[name].unit else ""
-                header.append(f"{name} = {shown(self, name)} ± {shown_std(self, name)}{unit}: {use}")
+                header.append(f"{name} = {' ± '.join(shown(self, name))}{unit}: {use}")
         before, after = self.held_out_m
         if math.isfinite(after):
             header.append(f"Held-out residuals, r.m.s.: {1e3 * before:.3g} mm before, {1e3 * after:.3g} mm after.")
@@ -236,20 +236,12 @@ def shown_names(found: Calibration) -> tuple[str, ...]:
     return (*(name for name in names if name not in HALF_ANGLES), *found.mounting.lens.terms)
 
 
-def shown(found: Calibration, name: str) -> str:
-    """Return one number of a mounting as people read it, to the digits of its standard deviation."""
-    return _value_and_std(found, name)[0]
-
-
-def shown_std(found: Calibration, name: str) -> str:
-    """Return its standard deviation."""
-    return _value_and_std(found, name)[1] if name in found.free else "fixed"
-
-
-def _value_and_std(found: Calibration, name: str) -> tuple[str, str]:
+def shown(found: Calibration, name: str) -> tuple[str, str]:
+    """Return one number of a mounting as people read it, to the digits of its standard deviation, and the latter."""
     value, std = PARAMETERS[name].shown * found.value(name), PARAMETERS[name].shown * found.std(name)
     text, error = value_and_error(value, std)
-    return (text, error) if error else (f"{value:.3f}", error_text(std))
+    text, error = (text, error) if error else (f"{value:.3f}", error_text(std))
+    return text, error if name in found.free else "fixed"
 
 
 def _mm(value_m: float) -> float | None:

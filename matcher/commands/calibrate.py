@@ -301,13 +301,13 @@ def _calibration_target(landmark: str, class_name: str | None, sensor: str | Non
 def _echo_calibration(found: Calibration) -> None:
     """Print every number with its standard deviation and use, their correlations, the test of the fit and notes."""
     from phasemark.matcher.calibration.mounting import PARAMETERS
-    from phasemark.matcher.calibration.result import USES, shown, shown_names, shown_std
+    from phasemark.matcher.calibration.result import USES, shown, shown_names
 
     rows = []
     for name in shown_names(found):
         parameter = PARAMETERS[name]
         use = USES.get(name) or f"{parameter.field} of the sensor"
-        rows.append((name, shown(found, name), shown_std(found, name), parameter.unit, use))
+        rows.append((name, *shown(found, name), parameter.unit, use))
     echo_table(("", "value", "±", "", "where it goes"), rows)
     if len(found.free) > 1:
         echo("\ncorrelation")
