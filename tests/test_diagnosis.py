@@ -18,7 +18,7 @@ from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, diagnose, kalman_filter
 from phasemark.matcher.commands.diagnosis_flags import diagnosis_text
 from phasemark.matcher.diagnosis import Change, Diagnosis
-from phasemark.matcher.diagnosis.search import _Seen
+from phasemark.matcher.diagnosis.search import pooled_evidence
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.background_estimate import estimate_surroundings
 from phasemark.matcher.match import Candidate, Match
@@ -75,9 +75,10 @@ def test_a_landmark_off_to_a_side_is_diagnosed_with_its_bearing(banks, name, bea
 def test_a_single_frame_of_a_direct_sensor_is_searched_with_the_noise_of_its_law():
     sensor = preset("vl53l5cx-8x8")
     image = Renderer(build_mesh(catalog()["cone"]), sensor, albedo=0.8).render(*CONE_VIEW)
-    seen = _Seen.of(kalman_filter(capture(image, sensor, rng=np.random.default_rng(1), n_frames=1)))
-    assert seen.returned.any()
-    assert seen.usual_std_m == pytest.approx(sensor.range_std_m)
+    frame = kalman_filter(capture(image, sensor, rng=np.random.default_rng(1), n_frames=1))
+    weight = pooled_evidence(frame).weight[0]
+    assert (weight > 0).any()
+    assert np.median(weight[weight > 0] ** -0.5) == pytest.approx(sensor.range_std_m)
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -217,23 +217,22 @@ def _are_apart(match: Match, other: Candidate) -> bool:
     return other.class_name != match.class_name or apart_m > TOLERANCE_M or float(turn_rad) > TOLERANCE_RAD
 
 
+_REMEDIES = {
+    "flip_h": "flip_h the other way round",
+    "flip_v": "flip_v the other way round",
+    "rotate": "rotate by {0}° more",
+    "unit_factor": "a unit {0:g} times as large",
+    "half_angle_deg": "a bank of a sensor with half_angle_h_deg={0[0]:.4g}, half_angle_v_deg={0[1]:.4g}",
+    "bearing_offset_deg": "a bank of a sensor with bearing_offset_deg={0:.3g}",
+    "distance_m": "a bank with distances to {0:.3g} m",
+}
+"""What to do for a change, with the names of the library, where that is not to give a parameter its value."""
+
+
 def _remedy(change: Change) -> str:
     """Return what to do, with the names of the library."""
-    value = change.value
-    match change.parameter:
-        case "method" | "on" | "free" | "background" | "quantity" | "invalid_means":
-            return f"{change.parameter}={value!r}"
-        case "flip_h" | "flip_v":
-            return f"{change.parameter} the other way round"
-        case "rotate":
-            return f"rotate by {value}° more"
-        case "unit_factor":
-            return f"a unit {value:g} times as large"
-        case "half_angle_deg":
-            return f"a bank of a sensor with half_angle_h_deg={value[0]:.4g}, half_angle_v_deg={value[1]:.4g}"
-        case "bearing_offset_deg":
-            return f"a bank of a sensor with bearing_offset_deg={value:.3g}"
-    return f"a bank with distances to {value:.3g} m"
+    told = _REMEDIES.get(change.parameter)
+    return f"{change.parameter}={change.value!r}" if told is None else told.format(change.value)
 
 
 _Behind = Background | Literal["auto", "unknown"] | None

@@ -10,7 +10,6 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,8 +104,9 @@ class Search:
         bearing : bool
             Whether the bearing is free; otherwise it is 0.
         """
-        seen = _Seen.of(frame)
-        if not seen.returned.any():
+        evidence = pooled_evidence(frame)
+        returned = evidence.weight[0] > 0
+        if not returned.any():
             return None
         free = VIEW[: 3 if bearing else 2]
         step_rad = _DELTA_STEP_RAD if len(sizes) == 1 else _WIDE_STEP_RAD
@@ -117,11 +117,11 @@ class Search:
 
         def refined(size: float, starts: Candidates, slack_m: float, *, roughly: bool = True) -> Fits:
             model, settings = self._before(background, size, free)
-            fits = refine(model, seen.with_slack(slack_m), starts, settings, roughly=roughly)
+            fits = refine(model, _with_slack(evidence, slack_m), starts, settings, roughly=roughly)
             return fits[np.argsort(fits.cost, kind="stable")]
 
         def first(size: float) -> Fits:
-            starts = self._best_of(*self._before(background, size, free), seen.with_slack(_SLACKS_M[0]), grid)
+            starts = self._best_of(*self._before(background, size, free), _with_slack(evidence, _SLACKS_M[0]), grid)
             return refined(size, starts[: _REFINED[0]], _SLACKS_M[0])
 
         size, fits = min(((size, first(size)) for size in sizes), key=lambda one: float(one[1].cost[0]))
@@ -132,12 +132,13 @@ class Search:
                 options={"xatol": _SIZE_KNOWN},
             )  # fmt: skip
             size = float(found.x)
+        usual_std_m = float(np.median(evidence.weight[0][returned] ** -0.5))
         for slack_m, n in zip((_SLACKS_M[1], 0.0), _REFINED[1:], strict=True):
-            if slack_m > seen.usual_std_m or slack_m == 0.0:
+            if slack_m > usual_std_m or slack_m == 0.0:
                 fits = refined(size, fits[:n], slack_m, roughly=slack_m > 0)
         c, view = int(fits.class_index[0]), fits.view[0].tolist()
         delta_rad = float(wrap_delta_rad(view[1], delta_period_rad(self._symmetry[c])))
-        n_pixels = int(seen.returned.sum())
+        n_pixels = int(returned.sum())
         return Fit(self._names[c], view[0], delta_rad, view[2], size, float(fits.cost[0]), n_pixels)
 
     def _before(
@@ -190,7 +191,7 @@ class Search:
     def with_fitted_background(self, frame: FilteredFrames, background: Background, fit: Fit) -> Background:
         """Return a background moved to where it and the landmark of a rough fit explain a frame best."""
         view = np.array([fit.distance_m, fit.delta_rad, fit.bearing_rad, 0.0, 0.0, 0.0])
-        model, evidence = self._model.seen_by(self._sensor), _Seen.of(frame).with_slack(0.0)
+        model, evidence = self._model.seen_by(self._sensor), _with_slack(pooled_evidence(frame), 0.0)
         return fit_background(model, evidence, self._names.index(fit.class_name), view, VIEW[:3], background)[0]
 
 
@@ -199,29 +200,14 @@ def _starts(class_index: NDArray[np.int64], view: _Float) -> Starts:
     return Starts(np.zeros(len(view), np.int64), class_index, view)
 
 
-class _Seen(NamedTuple):
-    """One frame with the noise of its pixels taken together."""
+def pooled_evidence(frame: FilteredFrames) -> Evidence:
+    """Return one frame with the noise of its pixels taken together."""
+    return Evidence.from_frames(frame.with_pooled_noise(), "ranges")
 
-    evidence: Evidence
 
-    @classmethod
-    def of(cls, frame: FilteredFrames) -> _Seen:
-        """Take a frame."""
-        return cls(Evidence.from_frames(frame.with_pooled_noise(), "ranges"))
-
-    @property
-    def returned(self) -> NDArray[np.bool_]:
-        """Which pixels returned, (pixels,)."""
-        return np.asarray(self.evidence.weight[0] > 0)
-
-    @property
-    def usual_std_m(self) -> float:
-        """Median standard deviation of a returned range."""
-        return float(np.median(self.evidence.weight[0][self.returned] ** -0.5))
-
-    def with_slack(self, slack_m: float) -> Evidence:
-        """Return the frame with a standard deviation added to its noise."""
-        return self.evidence.with_further_noise(math.hypot(slack_m, _LEAST_STD_M))
+def _with_slack(evidence: Evidence, slack_m: float) -> Evidence:
+    """Return evidence with a standard deviation added to its noise."""
+    return evidence.with_further_noise(math.hypot(slack_m, _LEAST_STD_M))
 
 
 def wider(sensor: Sensor, size: float) -> Sensor:
