@@ -15,11 +15,12 @@ from scipy import stats
 from phasemark import OutputExistsError, UsageError
 from phasemark.cli import main
 from phasemark.data.commands import console
+from phasemark.data.files.folder_marker import adding_to_folder
 from phasemark.matcher.plan_kinds import plan_schema
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import AXES, SHIPPED_SWEEPS, Method, SweepPlan, read_sweep_plan
 from phasemark.matcher.sweep.report import write_report
-from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_folder, sweep_frames
+from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_frames
 from phasemark.render import predicted_range_std
 
 EXACT = ("condition", "trial", "truth", "estimate", "bound", "covariance", "chi2", "p_value", "found", "accepted")
@@ -339,7 +340,7 @@ def test_a_file_of_somebody_else_in_a_folder_without_a_sweep_stays(tmp_path, nam
 def test_a_sweep_in_progress_is_left_alone_and_force_removes_its_files_and_no_others(tmp_path, capsys):
     run_sweep(plan(trials=4), tmp_path, workers=1)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with sweep_folder(tmp_path):
+    with adding_to_folder(tmp_path, "sweep run"):
         ways: tuple[dict[str, Any], ...] = ({"force": True}, {"resume": True}, {})
         for options in ways:
             with pytest.raises(OutputExistsError, match="another run is writing it"):

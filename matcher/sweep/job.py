@@ -27,6 +27,7 @@ from phasemark.data.files.provenance import mesh_sha256, versions
 from phasemark.data.scene_job import read_landmarks
 from phasemark.data.seeds import stream
 from phasemark.data.shards.build import Place
+from phasemark.inputs.own_program import imported_program
 from phasemark.matcher.accuracy.cramer_rao import confusion_probability, cramer_rao
 from phasemark.matcher.filters.filtered_frames import FilteredFrames, noise_free
 from phasemark.matcher.filters.kalman_filters import kalman_filter
@@ -36,7 +37,7 @@ from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY
 from phasemark.matcher.match import Matches
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.matcher.sweep.own_matcher import MatchFrames, imported_matcher, own_matches
+from phasemark.matcher.sweep.own_matcher import MatchFrames, own_matches
 from phasemark.matcher.sweep.plan import Condition, Method, SweepPlan
 from phasemark.render import Background, Frames, PhasorImages, Renderer, Sensor, Views, capture
 from phasemark.render.direct.capture import capture_ranges
@@ -393,7 +394,8 @@ class SweepJob:
 
     def _matcher(self, method: Method, background: Background | Literal["auto"] | None) -> MatchFrames:
         if method.is_program:
-            return imported_matcher(method.method)
+            match: MatchFrames = imported_program(method.method, "the matcher")
+            return match
         bank = self._bank(method)
         if method.method == "nearest":
             return Matcher(bank, background=background, false_alarm=method.false_alarm).match

@@ -9,24 +9,11 @@ from typing import Any
 import numpy as np
 
 from phasemark import UsageError
-from phasemark.inputs.own_program import called_program, imported_program
+from phasemark.inputs.own_program import called_program
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match, Matches
 
 MatchFrames = Callable[[FilteredFrames], Sequence[Match]]
-
-
-def imported_matcher(text: str) -> MatchFrames:
-    """Return the matcher that ``module:callable`` names.
-
-    Raises
-    ------
-    UsageError
-        It cannot be imported: with the reason; if the module's own code failed, its traceback is a note of the error
-        (:pep:`678`).
-    """
-    match: MatchFrames = imported_program(text, "the matcher")
-    return match
 
 
 def own_matches(

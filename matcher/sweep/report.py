@@ -15,6 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from phasemark.data.files.atomic_write import storage_errors, write_atomically
+from phasemark.data.files.folder_marker import adding_to_folder
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
 from phasemark.landmarks import mesh_figure
@@ -27,7 +28,7 @@ from phasemark.matcher.sweep.figures.style import AXIS_LABEL
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import SweepPlan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes, outlier_share, outliers_in_words
-from phasemark.matcher.sweep.run import read_plan_of, read_sweep, sweep_folder, write_cells
+from phasemark.matcher.sweep.run import read_plan_of, read_sweep, write_cells
 from phasemark.render.figures import RANGE_COLOURS, draw_range, landmark_limits_m
 from phasemark.render.integral.rounding import with_interval
 
@@ -61,7 +62,7 @@ def write_report(folder: str | os.PathLike[str]) -> Path:
     """
     folder = Path(folder)
     read_plan_of(folder)
-    with sweep_folder(folder) as ours:
+    with adding_to_folder(folder, "sweep run") as ours:
         plan, trials = read_sweep(folder)
         ours.claim("cells.csv", "sweep.json", "report.html")
         cells = write_cells(plan, trials, folder)

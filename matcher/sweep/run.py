@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -23,8 +22,8 @@ from phasemark.data.progress import Progress
 from phasemark.data.shards.build import difference
 from phasemark.data.shards.remote import check_scheduler
 from phasemark.data.shards.run import outputs_of, produce
+from phasemark.inputs.own_program import imported_program
 from phasemark.matcher.sweep.job import FORMAT, SCHEMA_VERSION, STORED, Round, SweepJob
-from phasemark.matcher.sweep.own_matcher import imported_matcher
 from phasemark.matcher.sweep.plan import SweepPlan, stored_plan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, csv_bytes, trials_csv
 from phasemark.render import Frames
@@ -83,12 +82,12 @@ def run_sweep(
     plan = plan.resolve()
     for method in plan.methods:
         if method.is_program:
-            imported_matcher(method.method)
+            imported_program(method.method, "the matcher")
     check_scheduler(scheduler)
     SweepJob(plan, Round.first_of(plan)).check_views()
     folder = Path(folder)
     refuse_inputs(sweep_outputs(folder), named_files(plan.model_dump()))
-    with sweep_folder(folder) as ours:
+    with adding_to_folder(folder, "sweep run") as ours:
         _begin(plan, ours, resume=resume, force=force)
         rounds: list[Round] = []
         following: Round | None = Round.first_of(plan)
@@ -205,17 +204,6 @@ def write_cells(plan: SweepPlan, trials: SweepTrials, folder: Path) -> tuple[Cel
 
 def _round_path(folder: Path, number: int) -> Path:
     return folder / f"trials-{number:03d}.h5"
-
-
-def sweep_folder(folder: Path) -> AbstractContextManager[OwnedFiles]:
-    """Lock a sweep's folder against other runs, and list the files in it that belong to the sweep.
-
-    Raises
-    ------
-    OutputExistsError
-        Another run is writing it.
-    """
-    return adding_to_folder(folder, "sweep run")
 
 
 def _begin(plan: SweepPlan, ours: OwnedFiles, *, resume: bool, force: bool) -> None:
