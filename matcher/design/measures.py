@@ -170,14 +170,9 @@ class ClassDistances:
     @staticmethod
     def row(one: Appearance, others: Sequence[Appearance]) -> tuple[NDArray[np.float64], ...]:
         """Compare frames of one part with images of others, (m, n) each."""
-        other = Appearance(
-            range_m=np.stack([o.range_m for o in others]),
-            weight=np.stack([o.weight for o in others]),
-            slope=np.stack([o.slope for o in others]),
-            coverage=np.stack([o.coverage for o in others]),
-            sensor=one.sensor,
-        )
-        cost, gradient, information = one.imitated_by(other)
+        names = ("range_m", "weight", "slope", "coverage")
+        stacked = {name: np.stack([getattr(other, name) for other in others]) for name in names}
+        cost, gradient, information = one.imitated_by(Appearance(**stacked, sensor=one.sensor))
         return cost, gradient[..., 0], information[..., 0, 0]
 
     def least(self, distance_information: NDArray[np.float64]) -> NDArray[np.float64]:
