@@ -124,14 +124,21 @@ def _named(k: int, recordings: int) -> Iterator[None]:
 
 
 class Place(NamedTuple):
-    """Mounting, zone offsets and what each recording has of its own, in a descent."""
+    """Mounting, zone offsets and what each recording has of its own, in a descent.
+
+    Parameters
+    ----------
+    theta : (22,) float64
+        Mounting.
+    zone : (pixels,) float64
+        Zone offsets, metres.
+    own : (R, q) float64
+        What each recording has of its own; metres, radians, seconds.
+    """
 
     theta: _Float
-    """(22,): mounting."""
     zone: _Float
-    """(pixels,): zone offsets, metres."""
     own: _Float
-    """(R, q): what each recording has of its own; metres, radians, seconds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +147,6 @@ class Recorded:
 
     model: CalibrationModel
     evidence: Evidence
-
-    @classmethod
-    def of(cls, problem: Problem) -> Recorded:
-        """Take the frames of one recording, on ranges."""
-        return cls(problem.model(), Evidence.from_frames(problem.frames, "ranges"))
 
     def residual(self, images: Images) -> _Float:
         """Return measured less modelled ranges without zone offsets, (K, pixels); NaN where there is none."""
@@ -196,7 +198,9 @@ class RecordingFit:
     def __init__(self, problem: Problem, *, edges: bool | None = None) -> None:
         self.problem, self.free, self.zones = problem, problem.common, problem.zones
         self.assumed, self.sensor = problem.assumed.vector, problem.sensor
-        self.recorded = [Recorded.of(one) for one in problem.recordings]
+        self.recorded = [
+            Recorded(one.model(), Evidence.from_frames(one.frames, "ranges")) for one in problem.recordings
+        ]
         self.seen_range_m = np.concatenate([one.evidence.seen.range_m for one in self.recorded])
         self.stated_weight = np.concatenate([one.evidence.weight for one in self.recorded])
         direct = self.sensor.kind == "direct"
@@ -522,6 +526,8 @@ class RecordingFit:
         frames_out = (use & seen).sum(axis=1) < shown / 2
         out_of = [frames_out[(self.recording == r) & (shown > few)] for r in range(len(self.recorded))]
         dof, systematic, p = int(use.sum()) - len(self.free), np.sqrt(sizes.variance), len(self.free)
+        std_own = np.sqrt(wider * np.diag(covariance))[p:][: place.own.size].reshape(place.own.shape)
+        own = np.stack([place.own, std_own], axis=-1)
         return Solution(
             problem=self.problem,
             theta=place.theta,
@@ -542,19 +548,11 @@ class RecordingFit:
             notes=tuple(sentences.recording_notes(use, left_out, systematic, in_file=self.zones)),
             left_out=left_out,
             frames_left_out=tuple(float(one.mean()) if one.size else 0.0 for one in out_of),
-            own=self._own_of_recordings(place, np.sqrt(wider * np.diag(covariance))),
+            own=tuple(dict(zip(self.own, map(tuple, one), strict=True)) for one in own.tolist()),
             tilt_std_rad=np.append(systematic, [0.0, 0.0])[len(LEVEL_EFFECTS) :][:2],
             sensor_fields=self._sensor_fields(
                 place.zone, noise, systematic, sizes.recording, overdispersion_of(pose_chi2, use.sum(axis=1))
             ),
-        )
-
-    def _own_of_recordings(self, place: Place, std: _Float) -> tuple[dict[str, tuple[float, float]], ...]:
-        """Return the own numbers of each recording with their standard deviations."""
-        spread = std[len(self.free) :][: place.own.size].reshape(place.own.shape)
-        return tuple(
-            {name: (float(own[i]), float(of_own[i])) for i, name in enumerate(self.own)}
-            for own, of_own in zip(place.own, spread, strict=True)
         )
 
     def _scatter_of_blocks(self, linear: RandomEffects, place: Place, sizes: Sizes, covariance: _Float) -> float:
