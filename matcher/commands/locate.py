@@ -89,6 +89,7 @@ def locate_rig(
     """
     from phasemark.matcher.locate.figures import locate_figure
     from phasemark.matcher.locate.pose_table import pose_csv
+    from phasemark.matcher.locate.smoothing import odometry_of
     from phasemark.matcher.locate.wall_map import map_of_run
 
     if start is None and not odometry:
@@ -106,7 +107,10 @@ def locate_rig(
             wall_map = locate.read_wall_map(map_file, name)
             limits = {"tolerance_m": tolerance, "tolerance_rad": math.radians(tolerance_yaw)}
             locator = locate.Locator(wall_map, rig, with_tilt=tilt, **limits)
-            found = _located(locator, recording, start, odometry, std, smooth)
+            if smooth:
+                odometry_of(recording)  # before the stops are located
+            found = _located(locator, recording, start, odometry, std)
+            found = locate.smoothed(recording, found, locator) if smooth else found
             drawn.append((recording.run, locator.model.outline, found, None))
             answers += found
             robot_key = recording.robot_key
@@ -120,19 +124,11 @@ def locate_rig(
 
 
 def _located(
-    locator: Locator,
-    recording: RigRecording,
-    start: Path | None,
-    odometry: bool,
-    std: tuple[float, float, float],
-    smooth: bool,
+    locator: Locator, recording: RigRecording, start: Path | None, odometry: bool, std: tuple[float, float, float]
 ) -> list[LocatedPose]:
     """Locate the stops of a recording from what is known beforehand."""
     from phasemark.matcher.locate.recording import poses_of, read_stop_poses
-    from phasemark.matcher.locate.smoothing import odometry_of
 
-    if smooth:
-        odometry_of(recording)  # before the stops are located
     starts = None if start is None else poses_of(recording, read_stop_poses(start))
     if starts is not None and all(math.isnan(pose[0]) for pose in starts):
         raise InputFileError(f"{start}: has no pose of '{recording.run}', whose first stop is {recording.key(0)[1]}")
@@ -142,10 +138,8 @@ def _located(
             first = {int(robot): pose for robot, pose in zip(recording.robot[::-1], starts[::-1], strict=True)}
             if any(math.isnan(pose[0]) for pose in first.values()):
                 raise UsageError(f"{start}: must have the first pose of each robot of '{recording.run}'")
-        answers = locator.follow(recording, first, std)
-    else:
-        answers = locator.locate(recording, starts, std)
-    return locate.smoothed(recording, answers, locator) if smooth else answers
+        return locator.follow(recording, first, std)
+    return locator.locate(recording, starts, std)
 
 
 def _echo_summary(answers: Sequence[LocatedPose]) -> None:
