@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, model_validator
 
 from phasemark import UsageError
@@ -146,8 +146,7 @@ class LandmarkMap(PlanModel):
         pan_rad: float = 0.0,
         *,
         prior: Sequence[float] | None = None,
-        prior_covariance: ArrayLike | None = None,
-        **mounting: Any,
+        **known: Any,
     ) -> list[Placement]:
         """Return every pose that a match allows at every landmark of its class, nearest to the prior first.
 
@@ -157,10 +156,10 @@ class LandmarkMap(PlanModel):
             Of one frame.
         pan_rad : float
             β.
-        prior, prior_covariance
-            As :func:`~phasemark.matcher.robot_poses` has them; without a prior in the order of the map.
-        **mounting
-            Its further keywords: offsets, ``pan_std_rad``, ``mounting_covariance``.
+        prior
+            As :func:`~phasemark.matcher.robot_poses` has it; without a prior in the order of the map.
+        **known
+            Its further keywords: ``prior_covariance``, offsets, ``pan_std_rad``, ``mounting_covariance``.
 
         Returns
         -------
@@ -177,9 +176,8 @@ class LandmarkMap(PlanModel):
                 landmark.yaw_rad,
                 pan_rad,
                 prior=prior,
-                prior_covariance=prior_covariance,
                 landmark_covariance=landmark.covariance,
-                **mounting,
+                **known,
             )
         ]
         return placements if prior is None else sorted(placements, key=lambda placement: placement.pose.mahalanobis)
