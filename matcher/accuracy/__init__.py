@@ -6,9 +6,14 @@ from phasemark.inputs import on_use
 
 if TYPE_CHECKING:
     from phasemark.matcher.accuracy.cramer_rao import Bound, confusion_probability
-    from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
+    from phasemark.matcher.accuracy.expected_accuracy import (
+        AccuracyCard,
+        MultipathShift,
+        accuracy_card,
+        multipath_shift,
+        sides_of,
+    )
     from phasemark.matcher.accuracy.grid_spacing import GridLoss, SpacingLoss, grid_loss
-    from phasemark.matcher.accuracy.multipath import MultipathShift, multipath_shift
     from phasemark.matcher.accuracy.pose_errors import PoseReport, pose_report
     from phasemark.matcher.accuracy.strangers import StrangerRate, stranger_rates
     from phasemark.matcher.accuracy.trials import Trials, TrialSetup, TrialSummary, run_trials
