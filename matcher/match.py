@@ -282,31 +282,18 @@ class Matches(Sequence[Match]):
     """
 
     class_name = _Column(np.object_)
-    """Names, None where there is no landmark; (n,)."""
     accepted = _Column(np.bool_)
-    """Whether each match passed its test; (n,)."""
     reason = _Column(np.object_)
-    """Why each answer is refused, empty where it is accepted; (n,)."""
     dof = _Column(np.int64)
-    """Degrees of freedom; (n,)."""
     distance_m = _Column(np.float64)
-    """Distances; (n,)."""
     delta_rad = _Column(np.float64)
-    """Angles δ; (n,)."""
     bearing_rad = _Column(np.float64)
-    """Bearings; (n,)."""
     height_m = _Column(np.float64)
-    """Heights; (n,)."""
     pitch_rad = _Column(np.float64)
-    """Pitch angles of the camera; (n,)."""
     roll_rad = _Column(np.float64)
-    """Roll angles of the camera; (n,)."""
     chi2 = _Column(np.float64)
-    """Whitened squared residuals; (n,)."""
     p_value = _Column(np.float64)
-    """Probabilities of a larger χ²; (n,)."""
     condition_number = _Column(np.float64)
-    """Condition of the information in the free parameters; (n,)."""
 
     def __init__(self, matches: Iterable[Match]) -> None:
         self._matches = tuple(matches)
