@@ -128,7 +128,7 @@ class SweepJob:
         self._banks: dict[str, Bank] = {}
         self._matchers: dict[tuple[Method, Background | Literal["auto"] | None], MatchFrames] = {}
         self._renderers: dict[tuple[Any, ...], Renderer] = {}
-        self._guard = threading.Lock()
+        self._guard = threading.RLock()
 
     @property
     def maker(self) -> str:
@@ -218,9 +218,7 @@ class SweepJob:
             if kind not in frames:
                 frames[kind] = self.frames(number, method, image, first)
             what = (on, method.parameters, method.pixels)
-            if what not in bounds and self.is_stranger(number):
-                bounds[what] = np.full((len(views), p, p), np.nan)
-            elif what not in bounds:
+            if what not in bounds:
                 bounds[what] = self.bound(number, method, views)
             begun = time.perf_counter()
             matches = self._match(number, m, frames[kind], first)
@@ -335,16 +333,18 @@ class SweepJob:
     def bound(self, number: int, method: Method, views: Views) -> NDArray[np.float64]:
         """Return the Cramér–Rao bound of the true world at some views.
 
-        (n, p, p), NaN for what is not estimated.
+        (n, p, p), NaN for what is not estimated, and for strangers.
         """
-        free = method.parameters
+        free, p = method.parameters, self.plan.n_numbers
+        if self.is_stranger(number):
+            return np.full((len(views), p, p), np.nan)
         found = cramer_rao(
             self.renderer(number, self.true_sensor(number).with_(modulation="sine", harmonics=())), views,
             free=free, n_frames=self.all_conditions[number].n_frames,
             on="phasors" if method.on == "phasors" else "ranges", pixels=method.pixels,
             background=self.background(number),
         )  # fmt: skip
-        return _spread(found.covariance, free, len(views), self.plan.n_numbers)
+        return _spread(found.covariance, free, len(views), p)
 
     def confusion(self, number: int, views: Views, first: int) -> NDArray[np.float64]:
         """Return a bound on how often another class explains a frame better, (n,); NaN beyond the first few trials.
@@ -396,7 +396,7 @@ class SweepJob:
         if method.is_program:
             match: MatchFrames = imported_program(method.method, "the matcher")
             return match
-        bank = self._bank(method)
+        bank = self.bank(method)
         if method.method == "nearest":
             return Matcher(bank, background=background, false_alarm=method.false_alarm).match
         on = self.explained(method)
@@ -405,17 +405,14 @@ class SweepJob:
             false_alarm=method.false_alarm, on=on, pixels=method.pixels, workers=1,
         ).match  # fmt: skip
 
-    def bank(self, m: int) -> Bank:
-        """Return the bank of a method."""
-        with self._guard:
-            return self._bank(self.plan.methods[m])
-
-    def _bank(self, method: Method) -> Bank:
+    def bank(self, method: Method) -> Bank:
+        """Return the bank of a method; it is kept."""
         plan = self.plan.bank_plan(method)
         key = json_text(plan)
-        if key not in self._banks:
-            self._banks[key] = build_bank(plan, workers=1)
-        return self._banks[key]
+        with self._guard:
+            if key not in self._banks:
+                self._banks[key] = build_bank(plan, workers=1)
+            return self._banks[key]
 
     def _match(self, number: int, m: int, frames: FilteredFrames, first: int) -> Matches:
         method = self.plan.methods[m]

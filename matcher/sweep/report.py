@@ -303,7 +303,7 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, rank: str, fold
         covariance=covariance if np.isfinite(covariance[:2, :2]).all() else None,
         **view,
     )
-    figure = match_figure(frames, match, job.bank(m), job.background(number), title=False)
+    figure = match_figure(frames, match, job.bank(job.plan.methods[m]), job.background(number), title=False)
     return {
         "title": f"{method}, {rank}: condition {number}, trial {trial}",
         "text": text,
