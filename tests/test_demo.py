@@ -15,9 +15,8 @@ from phasemark import UsageError
 from phasemark.cli import main
 from phasemark.data.seeds import stream
 from phasemark.matcher import Match, robot_poses
-from phasemark.matcher.sweep.answer import answer
 from phasemark.matcher.sweep.plan import SweepPlan, read_sweep_plan
-from phasemark.matcher.sweep.report import view_rows
+from phasemark.matcher.sweep.report import answer, view_rows
 from phasemark.matcher.sweep.run import read_sweep, run_sweep
 
 DEMO = read_sweep_plan("demo")

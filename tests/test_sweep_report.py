@@ -23,14 +23,13 @@ from phasemark.data import build_bank, read_frames
 from phasemark.landmarks import LandmarkSpec, build_mesh, catalog
 from phasemark.landmarks.spec import Box, Cylinder
 from phasemark.matcher.filters.kalman_filters import kalman_filter
-from phasemark.matcher.sweep.answer import answer, answer_cells
 from phasemark.matcher.sweep.compare import compare_cells
 from phasemark.matcher.sweep.figures.errors import against_axis, maps
 from phasemark.matcher.sweep.figures.sheet import sweep_figures
 from phasemark.matcher.sweep.figures.trust import confusion
 from phasemark.matcher.sweep.job import Round, SweepJob
 from phasemark.matcher.sweep.plan import Condition, Method, SweepPlan
-from phasemark.matcher.sweep.report import summary, write_report
+from phasemark.matcher.sweep.report import answer, answer_cells, summary, write_report
 from phasemark.matcher.sweep.result_tables import SweepTrials
 from phasemark.matcher.sweep.run import read_sweep, run_sweep, sweep_frames
 from phasemark.render import Renderer, preset

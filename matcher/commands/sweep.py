@@ -163,8 +163,7 @@ def demo_report(
     out
         Folder for trials, tables and the report.
     """
-    from phasemark.matcher.sweep.answer import answer
-    from phasemark.matcher.sweep.report import VIEW_HEADER, view_rows, write_report
+    from phasemark.matcher.sweep.report import VIEW_HEADER, answer, view_rows, write_report
 
     refuse_existing([out / "plan.json"], force)
     plan = sweep.read_sweep_plan("demo").model_copy(update={"seed": seed})

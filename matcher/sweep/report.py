@@ -6,7 +6,8 @@ import io
 import math
 import os
 import shlex
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -18,19 +19,21 @@ from phasemark.data.files.atomic_write import storage_errors, write_atomically
 from phasemark.data.files.folder_marker import adding_to_folder
 from phasemark.data.files.provenance import versions
 from phasemark.data.pages.page import embedded_png, figure_png, page_template, short_number
-from phasemark.landmarks import mesh_figure
+from phasemark.landmarks import mesh_figure, mesh_symmetry
+from phasemark.matcher.accuracy.expected_accuracy import AccuracyCard, accuracy_card, sides_of
 from phasemark.matcher.figures import match_figure
 from phasemark.matcher.match import Match
 from phasemark.matcher.statistics import Interval
-from phasemark.matcher.sweep.answer import answer, answer_cells, card_of, said
 from phasemark.matcher.sweep.figures.sheet import SweepFigure, sweep_figures
 from phasemark.matcher.sweep.figures.style import AXIS_LABEL
 from phasemark.matcher.sweep.job import Round, SweepJob
-from phasemark.matcher.sweep.plan import SweepPlan
+from phasemark.matcher.sweep.plan import Condition, SweepPlan
 from phasemark.matcher.sweep.result_tables import Cell, SweepTrials, condition_axes, outlier_share, outliers_in_words
 from phasemark.matcher.sweep.run import read_plan_of, read_sweep, write_cells
+from phasemark.render import Renderer
 from phasemark.render.figures import RANGE_COLOURS, draw_range, landmark_limits_m
 from phasemark.render.integral.rounding import with_interval
+from phasemark.render.view import delta_period_rad
 
 _MOST_EXAMPLES = 8
 _SEEN, _EXAMPLES, _AGAIN = "What the camera sees", "Typical and worst trials", "Make this page again"
@@ -38,6 +41,18 @@ VIEW_HEADER = ("D (m)", "δ (°)", "class right", "|ΔD| mm", "worst", "|Δδ| �
 """Columns of :func:`view_rows`."""
 _ALWAYS_SAID = ("class_name", "distance_m", "delta_deg", "noise_factor", "n_frames")
 _PARAMETERS = (("distance_m", "distance", " mm", 1e3), ("delta_rad", "angle", "°", 180 / math.pi))
+SAID = {
+    "class_name": "{}", "distance_m": "D = {:g} m", "delta_deg": "δ = {:g}°", "noise_factor": "{:g} times the noise",
+    "n_frames": "{:g} frames", "bearing_deg": "a bearing of {:g}°", "height_m": "a height of {:g} m",
+    "pitch_deg": "a pitch of {:g}°", "albedo": "an albedo of {:g}", "wall_m": "a wall at {:g} m",
+    "roll_deg": "a roll of {:g}°", "wiggling": "wiggling of {:g}", "unit": "unit {:g}",
+    "dimension_error": "dimensions off by {:g}", "floor_m": "a floor at {:g} m", "bounces": "{:g} bounces",
+}  # fmt: skip
+"""A condition in words, by the name of its axis."""
+ACCURATE = ("distance_m", "delta_rad")
+"""Parameters whose errors are told."""
+_POOLED = ("class_name", "distance_m", "delta_deg")
+_SAID_FIRST = (*_POOLED, "wall_m")
 
 
 def write_report(folder: str | os.PathLike[str]) -> Path:
@@ -310,3 +325,110 @@ def _example(job: SweepJob, trials: SweepTrials, m: int, k: int, rank: str, fold
         "image": embedded_png(figure_png(figure), text),
         "command": f"phasemark sweep frames {shlex.quote(str(folder))} {number} {trial} -o frames.npz",
     }
+
+
+def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
+    """Return the cells that a page answers with: one method's, of all classes and angles, at one distance.
+
+    The distance is the middle one of the design, the other axes are at their first values, and the method is the one
+    with the fewest outliers there, and of several the one whose other errors are nearest to the bound. The error itself
+    would favour a method that answers with grid points, which may be nearer to the truth than what the frames tell.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+
+    Returns
+    -------
+    list of Cell
+        Empty if no method found distance and angle in a cell of this kind.
+    """
+    if not cells:
+        return []
+    first = cells[0].condition
+    others = [field.name for field in fields(first) if field.name not in _POOLED]
+    plain = [one for one in cells if all(getattr(one.condition, name) == getattr(first, name) for name in others)]
+    distances = sorted({one.condition.distance_m for one in plain})
+    middle = distances[len(distances) // 2]
+    by_method: dict[str, list[Cell]] = {}
+    for one in plain:
+        if one.condition.distance_m == middle:
+            by_method.setdefault(one.method, []).append(one)
+    found = [own for own in by_method.values() if any(map(_found, own))]
+    return min(found, key=lambda own: (outlier_share(own), _pooled_ratio(own)), default=[])
+
+
+def answer(cells: Sequence[Cell]) -> str:
+    """State in one sentence the accuracy of the best method in the middle of the design.
+
+    Parameters
+    ----------
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+    """
+    own = answer_cells(cells)
+    if not own:
+        return "No method found distance and angle in the middle of the design."
+    condition = own[0].condition
+    where = said(condition, [name for name in condition_axes([c.condition for c in cells]) if name not in _SAID_FIRST])
+    wall = f", before a wall at {condition.wall_m:g} m," if condition.wall_m else ""
+    trials = sum(one.n for one in own)
+    right = sum(round(one.class_right.value * one.n) for one in own)
+    left_out = f", {outliers_in_words(own)} left out," if outlier_share(own) else ""
+    distance_m, delta_rad = (_rms([one.rmse[name].value for one in own if _found(one)]) for name in ACCURATE)
+    return (
+        f"At {condition.distance_m:g} m{f' ({where})' if where else ''}{wall} you get {1e3 * distance_m:.2g} mm"
+        f" and {math.degrees(delta_rad):.2g}° (1 σ){left_out} with {own[0].method}; class"
+        f" right {100 * right / trials:.4g} % of {trials} trials."
+    )
+
+
+def said(condition: Condition, axes: Iterable[str]) -> str:
+    """Return some fields of a condition in words."""
+    return ", ".join(SAID[name].format(getattr(condition, name)) for name in axes)
+
+
+def card_of(job: SweepJob, cells: Sequence[Cell]) -> AccuracyCard | None:
+    """Return the bound at the condition of :func:`answer`, from all sides, for the first class of it; None without one.
+
+    Parameters
+    ----------
+    job : SweepJob
+        What renders the conditions.
+    cells : sequence of Cell
+        Of landmarks, no strangers.
+    """
+    own = answer_cells(cells)
+    if not own:
+        return None
+    number, condition = own[0].number, own[0].condition
+    sensor = job.believed_sensor(number)
+    period = delta_period_rad(mesh_symmetry(job.objects[condition.class_name].mesh))
+    others = {
+        name: Renderer(job.objects[name].mesh, sensor, albedo=job.albedo_before(number, name))
+        for name in job.class_names
+        if name != condition.class_name
+    }
+    return accuracy_card(
+        job.renderer(number, sensor),
+        sides_of(condition.distance_m, period),
+        others=others,
+        n_frames=condition.n_frames,
+        background=job.background(number),
+    )
+
+
+def _found(cell: Cell) -> bool:
+    """Return whether a method has an error of distance and of angle."""
+    return all(name in cell.rmse and math.isfinite(cell.rmse[name].value) for name in ACCURATE)
+
+
+def _pooled_ratio(cells: Sequence[Cell]) -> float:
+    """Return the larger of the ratios of distance and angle to the bound, pooled; infinite where there is no bound."""
+    ratios = [_rms([one.ratio[name].value for one in cells if _found(one)]) for name in ACCURATE]
+    return max(ratios) if all(map(math.isfinite, ratios)) else math.inf
+
+
+def _rms(values: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
