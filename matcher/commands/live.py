@@ -205,9 +205,8 @@ def _tracker(bank: Bank, search: Search, motion: Motion, source: Source) -> Trac
         searches: Any = SearchesBeside(matcher)
     else:
         searches = SearchesInLine(matcher, logged=source.searches() if isinstance(source, McapSource) else None)
-    return Tracker(
-        matcher, estimator, searches, delay_s=None if motion.delay_ms is None else motion.delay_ms / 1e3
-    )  # fmt: skip
+    delay_s = None if motion.delay_ms is None else motion.delay_ms / 1e3
+    return Tracker(matcher, estimator, searches, delay_s=delay_s)
 
 
 def _views(bank: Bank | None, page: int | None, view: bool) -> list[Any]:

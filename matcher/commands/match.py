@@ -116,6 +116,7 @@ def _positions(
 ) -> tuple[Frames, FrameReading]:
     """Return the frames of a file, and how they are read: as stated, or with the orientation that they tell."""
     from phasemark.matcher.filters.stamps import with_tilts_when_taken
+    from phasemark.matcher.recordings.stillness import motion_note
 
     measured = reading.read(file, matcher.bank.camera)
     if learn:
@@ -123,7 +124,8 @@ def _positions(
         measured = reading.read(file, matcher.bank.camera)
     if moving:
         return with_tilts_when_taken(measured.each_a_position(), matcher.bank.sensor.delay_s), reading
-    _note_motion(measured, file)
+    if note := motion_note([measured]):
+        tell(f"note: {file}: {note}; --moving matches every frame by itself")
     return measured, reading
 
 
@@ -346,11 +348,3 @@ def _note_plots(plots: Mapping[int, Path], chosen: str | None, n: int) -> None:
             f"note: drew the first of {n} positions; --plot-index 0,{n // 2}:{min(n // 2 + 9, n - 1)} draws others"
             " (some seconds each)"
         )
-
-
-def _note_motion(measured: Frames, file: Path) -> None:
-    """Warn that frames to be averaged were not taken at rest."""
-    from phasemark.matcher.recordings.stillness import motion_note
-
-    if note := motion_note([measured]):
-        tell(f"note: {file}: {note}; --moving matches every frame by itself")
