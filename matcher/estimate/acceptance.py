@@ -198,12 +198,7 @@ def answer_of(
     return Match(
         class_name=candidates[0].class_name if is_landmark else None,
         accepted=not reason,
-        distance_m=candidates[0].distance_m,
-        delta_rad=candidates[0].delta_rad,
-        bearing_rad=candidates[0].bearing_rad,
-        height_m=candidates[0].height_m,
-        pitch_rad=candidates[0].pitch_rad,
-        roll_rad=candidates[0].roll_rad,
+        **{name: getattr(candidates[0], name) for name in VIEW_FIELDS},
         free=rules.free,
         covariance=covariance.copy() if np.isfinite(covariance).all() else None,
         chi2=float(fits.tested[best]),

@@ -135,6 +135,14 @@ def best_of_frame(fits: Fits) -> NDArray[np.int64]:
     return order[first]
 
 
+def with_refined(fits: Fits, which: NDArray[np.int64], again: Fits, n: int) -> Fits:
+    """Return fits of n frames, some of them refined again; others keep their distance from the best of the frame."""
+    change, refitted = np.zeros(n), np.unique(again.frame)
+    change[refitted] = least_of_frame(again, n)[refitted] - least_of_frame(fits, n)[refitted]
+    others = fits[np.setdiff1d(np.arange(len(fits)), which)]
+    return Fits.joined([again, replace(others, cost=others.cost + change[others.frame])])
+
+
 def distinct(
     fits: Fits,
     own: NDArray[np.int64],

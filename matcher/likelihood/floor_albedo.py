@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_frame
+from phasemark.matcher.estimate.fits import Fits, best_of_frame, distinct_of_frames, least_of_frame, with_refined
 from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.rendered_images import RenderedModel
@@ -57,13 +57,11 @@ def estimate_floors(
     """
     n, p = len(evidence.weight), len(setup.free)
     backgrounds, part = [stated] * n, np.zeros((n, p, p))
-    finite = np.flatnonzero(np.isfinite(fits.cost))
-    order = finite[np.lexsort((fits.cost[finite], fits.frame[finite]))]
-    frame, first = np.unique(fits.frame[order], return_index=True)
-    if not frame.size:
+    fits = fits[np.isfinite(fits.cost)]
+    best = fits[best_of_frame(fits)]
+    if not len(best):
         return Floors(backgrounds, part)
-    best = order[first]
-    class_index, view = fits.class_index[best], fits.view[best].copy()
+    frame, class_index, view = best.frame, best.class_index, best.view
     albedo = np.full(len(frame), stated.floor_albedo)
     columns = [VIEW.index(name) for name in setup.free]
     for step in range(_STEPS + 1):
@@ -108,8 +106,4 @@ def fit_before_floors(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     setup, least = scene.setup, least_of_frame(fits, len(evidence.weight))
     close = np.isfinite(fits.cost) & (fits.cost < least[fits.frame] + setup.policy.margin_cost)
     modes = distinct_of_frames(fits, np.flatnonzero(close), setup.rules.symmetry)
-    again = refine(scene.final, evidence, fits[modes], scene.settings())
-    others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
-    change = least_of_frame(again, len(least)) - least
-    others.cost[:] += np.where(np.isfinite(change), change, 0.0)[others.frame]
-    return Fits.joined([again, others])
+    return with_refined(fits, modes, refine(scene.final, evidence, fits[modes], scene.settings()), len(least))

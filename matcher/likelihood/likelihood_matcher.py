@@ -172,7 +172,7 @@ class LikelihoodMatcher:
             parts = zip(answers, floors.part, strict=True)
             answers = [with_parts(setup.rules, answer, {"floor_albedo": part}) for answer, part in parts]
         answers = self._with_mirror(evidence, answers, scene.search)
-        return self._with_shared_errors(frames, evidence, answers)
+        return with_shared_errors(setup, self.scenes, self._systematic, evidence, answers)
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames, each before what stands behind it."""
@@ -185,7 +185,7 @@ class LikelihoodMatcher:
             one, search = slice(k, k + 1), scenes.search if backgrounds[k] is None else scenes.open_search
             found = self._before_uncertain(backgrounds[k], evidence[one], found)
             mirrored = self._with_mirror(evidence[one], [found], search)
-            answers.extend(self._with_shared_errors(frames[one], evidence[one], mirrored))
+            answers += with_shared_errors(setup, scenes, self._systematic, evidence[one], mirrored)
         return answers
 
     def _before_uncertain(self, background: Background | None, evidence: Evidence, answer: Match) -> Match:
@@ -220,12 +220,6 @@ class LikelihoodMatcher:
         for k, answer, mirrored in zip(accepted, some, found, strict=True):
             answers[k] = replace(answer, may_be_mirrored=bool(mirrored))
         return answers
-
-    def _with_shared_errors(self, frames: FilteredFrames, evidence: Evidence, answers: list[Match]) -> list[Match]:
-        """Add to covariances what all frames of a camera share."""
-        return with_shared_errors(
-            self.setup, lambda: self.scenes.rendered, self._systematic, frames.sensor, evidence, answers
-        )
 
     def _bare_wall_cost(self, evidence: Evidence) -> NDArray[np.float64]:
         """Return how badly a wall at its best distance explains all of each frame, (n,)."""

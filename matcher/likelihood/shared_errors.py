@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from phasemark.matcher.estimate.acceptance import with_part, with_parts
 from phasemark.matcher.filters.stamps import spread_stamps
 from phasemark.matcher.information import covariance_of
 from phasemark.matcher.likelihood.images import VIEW
-from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
+from phasemark.matcher.likelihood.scenes import Scenes
 from phasemark.matcher.likelihood.setup import Setup
 from phasemark.matcher.likelihood.systematic import (
     Carried,
@@ -26,50 +26,43 @@ from phasemark.matcher.likelihood.systematic import (
 )
 from phasemark.matcher.match import Match
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.render import Sensor, Views
+from phasemark.render import Renderer, Views
 from phasemark.render.view import delta_period_rad
 
 __all__ = ["with_motion", "with_shared_errors"]
 
 
 def with_shared_errors(
-    setup: Setup,
-    rendered: Callable[[], RenderedModel],
-    systematic: Collection[Systematic],
-    sensor: Sensor,
-    evidence: Evidence,
-    answers: list[Match],
+    setup: Setup, scenes: Scenes, systematic: Collection[Systematic], evidence: Evidence, answers: list[Match]
 ) -> list[Match]:
     """Add what the calibration of a sensor leaves, what differs in another recording, and what the sensor declares.
 
     Parameters
     ----------
     setup : Setup
-    rendered : callable
-        Returns what renders the landmarks; called where a calibration has to be carried into a view.
+    scenes : Scenes
+        They have what renders the landmarks, where a calibration has to be carried into a view.
     systematic : collection of {"calibration", "recording", "declared", "multipath", "motion"}
-    sensor : Sensor
-        Of the frames.
     evidence : Evidence
     answers : list of Match
         One for each frame; refused as "undetermined" where they no longer are within the tolerance.
     """
     parts: list[dict[str, NDArray[np.float64]]] = [{} for _ in answers]
     known = [k for k, match in enumerate(answers) if match.covariance is not None and match.class_name is not None]
-    declared = declared_covariance(sensor, setup.free)
+    declared = declared_covariance(evidence.sensor, setup.free)
     if "declared" in systematic and declared.any():
         for k in known:
             parts[k]["declared"] = declared
     known_behind = answers[known[0]].background if known else None
-    if terms := carried_errors(sensor, systematic, known_behind):
+    if terms := carried_errors(evidence.sensor, systematic, known_behind):
         for c, name in enumerate(setup.rules.names):
             own = [k for k in known if answers[k].class_name == name]
             for accepted in (True, False):  # how light bounces takes long to find out
                 which = [k for k in own if answers[k].accepted == accepted]
                 some = {term: one for term, one in terms.items() if accepted or term != "multipath"}
                 if which and some:
-                    matches = [answers[k] for k in which]
-                    carried = _carried(setup, rendered(), sensor, evidence, c, which, matches, some)
+                    renderer, matches = scenes.rendered.renderer(c), [answers[k] for k in which]
+                    carried = _carried(setup, renderer, evidence[np.array(which)], matches, some)
                     for term, of_frames in carried.items():
                         for k, part in zip(which, of_frames, strict=True):
                             parts[k][term] = part
@@ -110,33 +103,24 @@ def with_motion(
 
 
 def _carried(
-    setup: Setup,
-    model: RenderedModel,
-    sensor: Sensor,
-    evidence: Evidence,
-    class_index: int,
-    which: list[int],
-    matches: list[Match],
-    terms: Mapping[Systematic, Carried],
+    setup: Setup, renderer: Renderer, evidence: Evidence, matches: list[Match], terms: Mapping[Systematic, Carried]
 ) -> dict[Systematic, NDArray[np.float64]]:
     """Return what errors of the sensor's fields make of the views of some frames of one class, (k, p, p) each."""
-    background, renderer = matches[0].background, model.renderer(class_index)
+    background, sensor, n = matches[0].background, evidence.sensor, len(matches)
     views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
     image = renderer.render_views(views, background=background)
-    slope = renderer.jacobian(
-        *(getattr(views, name) for name in VIEW),
-        background=background, parameters=setup.free,
-    )  # fmt: skip
+    parameters = (getattr(views, name) for name in VIEW)
+    slope = renderer.jacobian(*parameters, background=background, parameters=setup.free)
     fits_albedo = setup.on == "phasors" or (setup.albedo_std > 0 and background is not None)
     if fits_albedo:  # which takes up part of an error
         alone = image if background is None else renderer.render_views(views)
         slope = np.concatenate([slope, alone.phasor[:, None]], axis=1)
     by_fields = calibrated_slopes(renderer, sensor, views, image, background, fields_of(terms))
-    use = counts(image.phasor, image.intensity, sensor).reshape(len(which), -1) & setup.used
-    weight = np.where(use, evidence.weight[which], 0.0)
-    phasor = image.phasor.reshape(len(which), -1)
+    use = counts(image.phasor, image.intensity, sensor).reshape(n, -1) & setup.used
+    weight = np.where(use, evidence.weight, 0.0)
+    phasor = image.phasor.reshape(n, -1)
     if setup.unknown:
-        residual = range_residuals(phasor, evidence, which)
+        residual = range_residuals(phasor, evidence, np.arange(n))
         weight = np.where(weight * residual**2 > STRANGE_SIGMA**2, 0.0, weight)
 
     def whitened(slopes: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_frame
+from phasemark.matcher.estimate.fits import Fits, distinct_of_frames, least_of_frame, with_refined
 from phasemark.matcher.likelihood.images import ImageModel
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import STRANGE_SIGMA, Evidence, range_residuals, range_slopes
@@ -40,13 +40,8 @@ def fit_without_borders(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
     inside_evidence = replace(evidence, weight=evidence.weight * kept)
     again = refine(model, inside_evidence, some, scene.settings())
     again = again.with_scale(_scatter_of_columns(setup, model, inside_evidence, again))
-    others = fits[np.setdiff1d(np.arange(len(fits)), modes)]
     # fits that are not refined again cost less by as much as the best of their frame: its pixels were left out
-    less = np.zeros(len(evidence.weight))
-    refitted = np.unique(some.frame)
-    less[refitted] = least_of_frame(again, len(less))[refitted] - least[refitted]
-    others.cost[:] += less[others.frame]
-    return Fits.joined([again, others])
+    return with_refined(fits, modes, again, len(least))
 
 
 def _inside(setup: Setup, model: ImageModel, evidence: Evidence, fits: Fits) -> NDArray[np.bool_]:
