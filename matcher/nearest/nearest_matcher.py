@@ -6,8 +6,9 @@ The lower pixels give distance and angle, then the upper pixels give the class, 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.frequencies import background_of, phases_wrap
 from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, TOLERATED_SIGMA, Candidate, Match, Reason
-from phasemark.matcher.nearest.cell_fits import CellFits, Group, best_moves, fit_cells, follow_distance, moved_costs
+from phasemark.matcher.nearest.cell_fits import CellFits, best_moves, fit_cells, follow_distance, moved_costs
 from phasemark.matcher.nearest.grid import closing_period
 from phasemark.matcher.nearest.search import nearest_search
 from phasemark.matcher.nearest.templates import Observation, Templates
@@ -36,6 +37,16 @@ _APART_RAD = math.radians(2.0)
 _FACTOR = 8.0
 """What a rival costs at most about its grid point, over what the answer does: the fit in its cell tells more."""
 _Index = NDArray[np.int64]
+_Seen = Sequence[Observation]
+"""What each part of the bank is compared with."""
+
+
+class _Part(NamedTuple):
+    """Templates of the pixels that give distance and angle, or of the upper ones, which tell the class."""
+
+    templates: Templates
+    follows: NDArray[np.bool_]
+    rows: tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,17 +103,19 @@ class NearestMatcher:
         self._closes = closing_period(bank.delta_rad) is not None
         self._behind = None if background is None else background_of(bank, background)
         self._symmetry = {name: int(bank.mesh(name).metadata["symmetry"]) for name in bank.classes}
-        whole = bank.full or bank.lower
+        whole, sensor = bank.full or bank.lower, bank.sensor
         assert whole is not None
-        self._pose_rows = (0, bank.sensor.rows) if bank.full is not None else bank.sensor.lower_rows
-        self.pose = self._templates(whole, self._pose_rows)
-        self._class = None if bank.upper is None else self._templates(bank.upper, bank.sensor.upper_rows)
-        self._pose_follows = follow_distance(self.pose, bank.distance_m, len(bank.delta_rad))
-        self._class_follows = None if self._class is None else follow_distance(self._class, bank.distance_m, 1)
+        rows = (0, sensor.rows) if bank.full is not None else sensor.lower_rows
+        self._parts = [self._part(whole, rows, len(bank.delta_rad))]
+        if bank.upper is not None:
+            self._parts.append(self._part(bank.upper, sensor.upper_rows, 1))
+        self._is_factored, self.pose = len(self._parts) > 1, self._parts[0].templates
         self.search = nearest_search(
             self.pose, bank.distance_m, bank.delta_rad, before_background=background is not None
         )
-        self._none = self._nothing()
+        shape = 1, sensor.rows, sensor.cols
+        nothing = np.zeros(shape, np.complex64), np.zeros(shape, np.float32)
+        self._none = Templates.of_parts([nothing], sensor, self._behind, (0, sensor.rows))
 
     def match(self, frames: FilteredFrames) -> list[Match]:
         """Match filtered frames."""
@@ -111,84 +124,66 @@ class NearestMatcher:
             matches.extend(self._match_some(frames[start : start + _FRAMES_AT_ONCE]))
         return matches
 
-    def _templates(self, group: BankGroup, rows: tuple[int, int]) -> Templates:
-        parts = ((some.phasor, some.coverage) for _, some in group.parts())
-        return Templates.of_parts(parts, self._bank.sensor, self._behind, rows, wraps=phases_wrap(self._bank))
+    def _part(self, group: BankGroup, rows: tuple[int, int], angles: int) -> _Part:
+        parts, bank = ((some.phasor, some.coverage) for _, some in group.parts()), self._bank
+        templates = Templates.of_parts(parts, bank.sensor, self._behind, rows, wraps=phases_wrap(bank))
+        return _Part(templates, follow_distance(templates, bank.distance_m, angles), rows)
 
     def _match_some(self, frames: FilteredFrames) -> list[Match]:
-        pose_seen = Observation.from_frames(frames, self._pose_rows)
-        class_seen = None if self._class is None else Observation.from_frames(frames, self._bank.sensor.upper_rows)
-        found = self._searched(pose_seen, class_seen)
-        seen = Observation.from_frames(frames, (0, self._bank.sensor.rows))
-        none_cost = self._none.costs_of_each(seen, np.zeros((len(frames), 1), np.int64))[:, 0]
-        enough = pose_seen.returned.sum(axis=1) >= MIN_RETURNS
+        seen = [Observation.from_frames(frames, part.rows) for part in self._parts]
+        found = self._searched(seen)
+        whole = Observation.from_frames(frames, (0, self._bank.sensor.rows))
+        none_cost = self._none.costs_of_each(whole, np.zeros((len(frames), 1), np.int64))[:, 0]
+        enough = seen[0].returned.sum(axis=1) >= MIN_RETURNS
         p_value = p_values_of(found.of_best(found.chi2), found.of_best(found.dof), noise_tails(frames))
         ambiguous = np.zeros(len(frames), np.bool_)
         good = np.flatnonzero(enough & (p_value >= self._false_alarm))
         if good.size:
-            its_class = None if class_seen is None else class_seen[good]
-            ambiguous[good] = self._have_rivals(frames[good], pose_seen[good], its_class, found[good])
-        nothing = Match(
-            class_name=None,
-            accepted=False,
-            class_probability=self._probabilities(np.empty(0), 0.0),
-            reason="no landmark",
-        )
+            ambiguous[good] = self._have_rivals(frames[good], [own[good] for own in seen], found[good])
+        none = self._probabilities(np.empty(0), 0.0)
+        nothing = Match(class_name=None, accepted=False, class_probability=none, reason="no landmark")
         return [
             self._answer(found[k], float(none_cost[k]), float(p_value[k]), bool(ambiguous[k])) if enough[k] else nothing
             for k in range(len(frames))
         ]
 
-    def _searched(self, pose_seen: Observation, class_seen: Observation | None) -> _Found:
+    def _searched(self, seen: _Seen) -> _Found:
         """Find the nearest image of each class; in a factored bank the nearest lower one, and the upper ones there."""
         n_class, n_distance, n_delta = len(self._bank.classes), len(self._bank.distance_m), len(self._bank.delta_rad)
-        blocks = range(n_class if class_seen is None else 1)
-        nearest = [self.search.nearest(pose_seen, c)[0] for c in blocks]
+        blocks = range(1 if self._is_factored else n_class)
+        nearest = [self.search.nearest(seen[0], c)[0] for c in blocks]
         best = np.stack(nearest, axis=1) - np.asarray(blocks) * n_distance * n_delta
         i, j = np.divmod(np.broadcast_to(best, (len(best), n_class)), n_delta)
         frame, c = (index.ravel() for index in np.indices(i.shape))
-        fits = self._cells(pose_seen, class_seen, frame, c, i.ravel(), j.ravel())
+        fits = self._cells(seen, frame, c, i.ravel(), j.ravel())
         cost = fits.cost.reshape(i.shape)
         chi2, dof, offset = fits.chi2.reshape(i.shape), fits.dof.reshape(i.shape), fits.offset.reshape(*i.shape, 2)
         return _Found(i, j, chi2, dof, cost, offset, np.argmin(cost, axis=1))
 
-    def _nothing(self) -> Templates:
-        """Return the one template of a scene without a landmark."""
-        sensor = self._bank.sensor
-        shape = 1, sensor.rows, sensor.cols
-        nothing = np.zeros(shape, np.complex64), np.zeros(shape, np.float32)
-        return Templates.of_parts([nothing], sensor, self._behind, (0, sensor.rows))
-
-    def _have_rivals(
-        self,
-        frames: FilteredFrames,
-        pose_seen: Observation,
-        class_seen: Observation | None,
-        found: _Found,
-    ) -> NDArray[np.bool_]:
+    def _have_rivals(self, frames: FilteredFrames, seen: _Seen, found: _Found) -> NDArray[np.bool_]:
         """Return which frames a view beyond the tolerance, or of another class, explains about as well.
 
         At every angle the distance that fits best is asked: a flat valley along δ has no minimum of its own.
         """
         n, best, best_cost = len(frames), found.best, found.of_best(found.cost)
         # the cost about a grid point tells roughly what a frame costs in its cell
-        limit = _FACTOR * (self._costs_of_best(pose_seen, class_seen, found) + DISAGREEMENT)
+        limit = _FACTOR * (self._costs_of_best(seen, found) + DISAGREEMENT)
         rivalled = np.zeros(n, np.bool_)
         for c in range(len(self._bank.classes)):
-            if c == 0 or class_seen is None:
+            if c == 0 or not self._is_factored:
                 columns = self._columns(c)
                 frame, j = np.repeat(np.arange(n), len(columns)), np.tile(columns, n)
                 best_i, best_j = (found.of_best(values)[frame] for values in (found.i, found.j))
-                i, cost = self._best_distances(pose_seen, frame, c, found.i[:, c], j)
+                i, cost = self._best_distances(seen[0], frame, c, found.i[:, c], j)
             is_other = (best[frame] != c) | self._far(c, i, j, best_i, best_j)
             asked = np.flatnonzero(is_other & (cost < limit[frame]))
-            if class_seen is not None:
-                cost_of_class = self._class_costs(class_seen, frame[asked], c, i[asked])
+            if self._is_factored:
+                cost_of_class = self._costs_about(1, seen[1], c * len(self._bank.distance_m) + i[asked], frame[asked])
                 asked = asked[cost[asked] + cost_of_class < limit[frame[asked]]]
             if not asked.size:
                 continue
             own = frame[asked]
-            theirs = self._cells(pose_seen, class_seen, own, np.full(len(own), c), i[asked], j[asked])
+            theirs = self._cells(seen, own, np.full(len(own), c), i[asked], j[asked])
             along_delta = np.where(is_other, np.inf, -np.inf)
             along_delta[asked] = theirs.cost
             is_minimum = _is_minimum(along_delta.reshape(n, len(columns)), closes=self._closes).ravel()[asked]
@@ -212,36 +207,28 @@ class NearestMatcher:
         i, first = start[frame], block * len(distance_m)
         for step in range(_STEPS):
             group = self.pose, seen, (first + i) * n_delta + j
-            moved_m = best_moves(group, self._pose_follows, frame, self._size_m / 2**step)
+            moved_m = best_moves(group, self._parts[0].follows, frame, self._size_m / 2**step)
             i = np.searchsorted(between, distance_m[i] + moved_m)
-        return i, self._costs_about((self.pose, seen, (first + i) * n_delta + j), self._pose_follows, frame)
+        return i, self._costs_about(0, seen, (first + i) * n_delta + j, frame)
 
-    def _costs_about(self, group: Group, follows: NDArray[np.bool_], frame: _Index) -> NDArray[np.float64]:
-        """Return what frames cost about points of the grid, at the best distance there; (m,)."""
-        moved_m = best_moves(group, follows, frame, self._size_m).clip(-self._step_m, self._step_m)
-        return moved_costs(group, follows, frame, moved_m, self._turned_m)
+    def _costs_about(self, part: int, seen: Observation, at: _Index, frame: _Index) -> NDArray[np.float64]:
+        """Return what pixels of frames cost about points of the grid, at the best distance there; (m,)."""
+        templates, follows, _ = self._parts[part]
+        moved_m = best_moves((templates, seen, at), follows, frame, self._size_m).clip(-self._step_m, self._step_m)
+        return moved_costs((templates, seen, at), follows, frame, moved_m, self._turned_m)
 
-    def _class_costs(self, class_seen: Observation, frame: _Index, c: int | _Index, i: _Index) -> NDArray[np.float64]:
-        """Return what the upper pixels cost about distances of the grid; (m,)."""
-        assert self._class is not None
-        assert self._class_follows is not None
-        group = self._class, class_seen, c * len(self._bank.distance_m) + i
-        return self._costs_about(group, self._class_follows, frame)
-
-    def _costs_of_best(
-        self, pose_seen: Observation, class_seen: Observation | None, found: _Found
-    ) -> NDArray[np.float64]:
+    def _costs_of_best(self, seen: _Seen, found: _Found) -> NDArray[np.float64]:
         """Return what frames cost about their best grid points, (n,)."""
-        n, c, i = np.arange(len(found.best)), found.best, found.of_best(found.i)
-        first = 0 if class_seen is not None else c * len(self._bank.distance_m)
-        at = (first + i) * len(self._bank.delta_rad) + found.of_best(found.j)
-        cost = self._costs_about((self.pose, pose_seen, at), self._pose_follows, n)
-        return cost if class_seen is None else cost + self._class_costs(class_seen, n, c, i)
+        n, i = np.arange(len(found.best)), found.of_best(found.i)
+        of_class = found.best * len(self._bank.distance_m) + i
+        at = (i if self._is_factored else of_class) * len(self._bank.delta_rad) + found.of_best(found.j)
+        cost = self._costs_about(0, seen[0], at, n)
+        return cost + self._costs_about(1, seen[1], of_class, n) if self._is_factored else cost
 
     def _columns(self, class_index: int) -> _Index:
         """Return which angles of the grid are asked for rivals: over a period of the class, or of the lower part."""
         delta_rad = self._bank.delta_rad
-        symmetry = self._symmetry[self._bank.classes[class_index]] if self._class is None else 1
+        symmetry = 1 if self._is_factored else self._symmetry[self._bank.classes[class_index]]
         n = np.searchsorted(delta_rad, delta_rad[0] + delta_period_rad(symmetry) - 1e-9)
         step = np.diff(delta_rad).min(initial=_APART_RAD)
         return np.arange(0, max(n, 1), max(int(_APART_RAD / step + 1e-9), 1))
@@ -311,25 +298,16 @@ class NearestMatcher:
         weight = np.exp(-0.5 * (values - values.min()))
         return dict(zip(names, (weight / weight.sum()).tolist(), strict=True))
 
-    def _cells(
-        self,
-        pose_seen: Observation,
-        class_seen: Observation | None,
-        frame: _Index,
-        c: _Index,
-        i: _Index,
-        j: _Index,
-    ) -> CellFits:
+    def _cells(self, seen: _Seen, frame: _Index, c: _Index, i: _Index, j: _Index) -> CellFits:
         """Fit frames in the cells around grid points, (m,) each."""
         n_distance, n_delta = len(self._bank.distance_m), len(self._bank.delta_rad)
         rows = np.stack([i, np.maximum(i - 1, 0), np.minimum(i + 1, n_distance - 1), i, i], axis=-1)
         columns = np.stack([j, j, j, j - 1, j + 1], axis=-1)
         columns = columns % n_delta if self._closes else np.clip(columns, 0, n_delta - 1)
         of_class = c[:, None] * n_distance + rows
-        groups = [(self.pose, pose_seen, (of_class if class_seen is None else rows) * n_delta + columns)]
-        if class_seen is not None:
-            assert self._class is not None
-            groups.append((self._class, class_seen, of_class))
+        groups = [(self.pose, seen[0], (rows if self._is_factored else of_class) * n_delta + columns)]
+        if self._is_factored:
+            groups.append((self._parts[1].templates, seen[1], of_class))
         return fit_cells(groups, frame)
 
 
