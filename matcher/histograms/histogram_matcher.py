@@ -53,10 +53,11 @@ class HistogramMatcher(HistogramSearch):
         if not starts:
             return no_answer(self.rules)
         fits: Found = []
-        error, left = 0.0, list(starts)
+        error, left, alarm = 0.0, list(starts), self.rules.false_alarm
         while left:
             likely = left[0].cost < starts[0].cost + SURE_COST + _MORE * error
-            if len(starts) - len(left) >= _FEWEST and not likely and not self._is_poor(fits):
+            # a hill that the table undervalues may explain a frame that no fit does
+            if len(starts) - len(left) >= _FEWEST and not likely and not self._tested(fits)[0].p_value < alarm:
                 break
             start = left.pop(0)
             if _follow(fits, self.searches[start.class_index], frame, start):
@@ -71,10 +72,6 @@ class HistogramMatcher(HistogramSearch):
         best_class, best = _best(fits)
         estimated = _estimated(self.searches[best_class], best)
         return FitTest(*deviance_test(best.deviance, *moments_of(best.level), estimated)), estimated
-
-    def _is_poor(self, fits: Found) -> bool:
-        """Return whether no fit explains the frame: a hill that the table undervalues may."""
-        return self._tested(fits)[0].p_value < self.rules.false_alarm
 
     def match_jointly(self, frames: HistogramFrames, first2camera: NDArray[np.float64]) -> Match:
         """Return one answer for a landmark that several positions see, the view as the first one has it.

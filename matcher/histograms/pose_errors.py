@@ -13,7 +13,7 @@ transform U_ij = L_i D L_jᵀ with the lever L_i of each pose; the mesh adds its
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -130,14 +130,9 @@ class Contrast:
 
     def less(self, other: Contrast) -> Contrast:
         """Return the difference from another estimate of the same object."""
-
-        def both(name: str) -> _Float:
-            return np.concatenate([getattr(self, name), getattr(other, name)])
-
-        weight = np.concatenate([self.weight, -other.weight])
-        return Contrast(
-            both("information"), both("squares"), both("direction"), both("lever"), self.places, weight
-        )  # fmt: skip
+        names = ("information", "squares", "direction", "lever")
+        both = {name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in names}
+        return replace(self, **both, weight=np.concatenate([self.weight, -other.weight]))
 
     def hand(self) -> _Float:
         """Return by how much it errs where the hand-eye transform does, (p, 6)."""

@@ -8,7 +8,7 @@ adds to the variance with which a bin is weighted.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -72,18 +72,15 @@ class Evidence:
 
     def of_poses(self, poses: NDArray[np.integer]) -> Evidence:
         """Return the evidence of some sensor poses."""
-        return Evidence(
-            self.information[poses], self.gradient[poses], self.chi2[poses], self.dof[poses], self.free,
-            self.direction[poses], self.lever[poses],
-        )  # fmt: skip
+        own = {name: values[poses] for name, values in vars(self).items() if name != "free"}
+        return replace(self, **own)
 
     def of_parameters(self, free: Sequence[str]) -> Evidence:
         """Return the evidence about some of the parameters, the others being known."""
         k = [self.free.index(name) for name in free]
-        information = self.information[..., k, :][..., k]
-        return Evidence(
-            information, self.gradient[..., k], self.chi2, self.dof, tuple(free), self.direction, self.lever
-        )  # fmt: skip
+        return replace(
+            self, information=self.information[..., k, :][..., k], gradient=self.gradient[..., k], free=tuple(free)
+        )
 
     @classmethod
     def joined(cls, parts: Sequence[Evidence]) -> Evidence:

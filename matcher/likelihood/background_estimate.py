@@ -22,7 +22,7 @@ from phasemark.matcher.likelihood.rendered_images import RenderedModel
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.nearest.templates import Observation
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.render import Background, Sensor
+from phasemark.render import Background
 
 CLEARLY_BEHIND_M = 0.4
 """Farther than the nearest surface by more than a landmark is deep."""
@@ -92,7 +92,7 @@ def estimate_surroundings(
     nothing = np.zeros(ranges.size, np.bool_)
     if returned.sum() < _FEWEST:
         return Surroundings(None, nothing, nothing)
-    ray = _level_rays(sensor)
+    ray = np.moveaxis(sensor.pixel_directions(), -1, 0)
     floor_m, on_floor = _floor_in_rows(ranges, frames.std_m[index], ray) if tilt_known else (None, nothing)
     on_floor = on_floor.reshape(ranges.shape)
     forward = sensor.axis_cosine() * ranges
@@ -335,14 +335,6 @@ def _inner(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     padded = np.pad(mask, 1, constant_values=True)
     rows, cols = mask.shape
     return np.asarray(np.logical_and.reduce([padded[i : i + rows, j : j + cols] for i in range(3) for j in range(3)]))
-
-
-def _level_rays(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the ray of every pixel's centre in the level camera, (3, rows, cols), unit vectors."""
-    v, u = np.mgrid[: sensor.rows, : sensor.cols] + 0.5
-    ray = np.stack([np.ones_like(u), *sensor.tangents(u, v)])
-    ray /= np.linalg.norm(ray, axis=0)
-    return np.asarray(np.einsum("jk,krc->jrc", sensor.cam2level, ray))
 
 
 def _weighted_middle(values: NDArray[np.float64]) -> float:

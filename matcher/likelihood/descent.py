@@ -55,7 +55,7 @@ def descend(problem: Problem, state: State, settled: float) -> State:
         active, step, promise, limited = active[worth], step[worth], promise[worth], limited[worth]
         if not active.size:
             break
-        theta = state.theta[active].copy()
+        theta = state.theta[active]
         theta[:, problem.columns] += step
         theta[:, :ALBEDO_COLUMN] = problem.clipped(theta[:, :ALBEDO_COLUMN], active)
         theta[:, ALBEDO_COLUMN] = np.maximum(theta[:, ALBEDO_COLUMN], 1e-3)

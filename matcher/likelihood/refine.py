@@ -21,7 +21,7 @@ from phasemark.matcher.likelihood.contradictions import contradicted_pixels, out
 from phasemark.matcher.likelihood.descent import ROUGH_COST, SETTLED_COST, descend, look_beside, settle
 from phasemark.matcher.likelihood.images import VIEW, ImageModel
 from phasemark.matcher.likelihood.problem import ALBEDO_COLUMN, DescentSettings, Problem, State, picked
-from phasemark.matcher.likelihood.residuals import Evidence, Sums
+from phasemark.matcher.likelihood.residuals import Evidence
 from phasemark.matcher.likelihood.uncertainty import (
     capped_std,
     slopes_along_axes,
@@ -185,7 +185,9 @@ def conclude(problem: Problem, state: State, *, look_around: bool = True) -> Fit
     # 1  count contradicted pixels within three standard deviations, by the covariance of the descent's own slopes
     nowhere = np.empty(0, np.intp)
     near = _near_solutions(problem, state) if look_around or problem.model.slopes_are_cheap else nowhere
-    sums, covariance = _sums_of_all_pixels(problem, state), view_covariance(problem, state)
+    sums, covariance = state.sums, view_covariance(problem, state)
+    if not settings.used.all():  # over all pixels, also those that do not give the view
+        sums = problem.with_prior(problem.sums(state.images, state.use), state.theta)
     pixels = _judged_pixels(problem, state, near, covariance)
     # 2  take the covariance of solutions that may still win from wide differences
     competitive = near[(sums.cost + _further_cost(pixels))[near] <= problem.rival[near] + DISAGREEMENT]
@@ -256,13 +258,6 @@ def _uncertainty(
             covariance[near] = view_covariance(there, smooth)
         without_one[near] = std_without_one_pixel(there, smooth, covariance[near])
     return covariance, without_one
-
-
-def _sums_of_all_pixels(problem: Problem, state: State) -> Sums:
-    """Return the sums of solutions over all pixels, also those that do not give the view."""
-    if problem.settings.used.all():
-        return state.sums
-    return problem.with_prior(problem.sums(state.images, state.use), state.theta)
 
 
 class _Pixels(NamedTuple):

@@ -401,10 +401,8 @@ class Locator:
         near = [k for k in range(len(fits)) if excess[k] < DISAGREEMENT and fits[k].share >= self.least_explained]
         weight = np.exp(-0.5 * excess)
         weight /= weight.sum()
-        candidates = []
-        for k in near:
-            x, y, yaw = fits[k].pose.tolist()
-            candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
+        rated = [(fits[k], float(excess[k]), float(weight[k])) for k in near]
+        candidates = tuple(PoseCandidate(*fit.pose.tolist(), more, share, fit.share) for fit, more, share in rated)
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
         least = self.least_explained
@@ -426,7 +424,7 @@ class Locator:
             observed=best.observed,
             accepted=not reason,
             reason=reason,
-            alternatives=tuple(candidates),
+            alternatives=candidates,
             evidence=_without(best, prior),
             tilt=self._tilt(best),
         )

@@ -122,15 +122,7 @@ def zones_from_depth(
     facing = None if normals is None else _normal_images(normals, depth.shape)
     plan = _plan(shape, camera, turn, sensor, allow_uncovered)
     seen = [
-        _see(
-            depth[k],
-            plan,
-            sensor,
-            quantity,
-            rho[k] if rho.ndim == depth.ndim else rho,
-            None if facing is None else facing[k],
-        )
-        for k in range(len(depth))
+        _see(depth[k], plan, sensor, quantity, rho[k], None if facing is None else facing[k]) for k in range(len(depth))
     ]
     return _zones(seen, sensor)
 
@@ -205,11 +197,8 @@ def _plan(
 
 def _axes(shape: tuple[int, int], camera: tuple[float, ...]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return centres and borders of the columns, and of the rows, as tangents."""
-    focal, centre = camera[:2], camera[2:]
-    axes = []
-    for n, f, c in zip(shape[::-1], focal, centre, strict=True):
-        axes.append(((np.arange(n, dtype=np.float64) - c) / f, (np.arange(n + 1, dtype=np.float64) - 0.5 - c) / f))
-    return axes
+    axes = zip(shape[::-1], camera[:2], camera[2:], strict=True)
+    return [((np.arange(n) - c) / f, (np.arange(n + 1) - 0.5 - c) / f) for n, f, c in axes]
 
 
 def _widened(borders: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -237,13 +226,12 @@ def _see(
     z = depth / plan.length if quantity == "range" else depth
     inverse = 1 / z
     range_m = np.where(returns, z * plan.length, 0.0)
-    amplitudes = [np.empty(depth.shape), np.empty(depth.shape)]
+    amplitudes = np.empty((2, *depth.shape))
     if normals is None:
         for step, amplitude in zip((1, _COARSE), amplitudes, strict=True):
             fill_amplitudes(inverse, plan.x, plan.y, step, amplitude)
     else:
-        given = _cosine(normals, plan, returns) * np.where(returns, inverse / plan.length, 0.0) ** 2
-        amplitudes = [given, given]
+        amplitudes[:] = _cosine(normals, plan, returns) * np.where(returns, inverse / plan.length, 0.0) ** 2
     fine, blunt = ((albedo * plan.falloff * amplitude).ravel() for amplitude in amplitudes)
     columns_hz = phasor_frequencies_hz(sensor.frequencies_hz, sensor.harmonic_orders)
     phasors, coarse = [], []
@@ -377,14 +365,14 @@ def _rotation(depth2camera: ArrayLike | None) -> tuple[float, ...]:
 
 
 def _albedos(albedo: ArrayLike | None, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return one albedo, or an image of them, or as many images as there are depth images."""
+    """Return albedos as (n, H, W)."""
     values = _numbers("albedo", _ALBEDO if albedo is None else albedo)
     if values.shape not in ((), shape[1:], shape):
         raise UsageError(f"'albedo' must be a number or have shape {shape[1:]} or {shape}, got {values.shape}")
     wrong = values[(values < 0) | (values > 1)]
     if wrong.size:
         raise UsageError(f"'albedo' must be in [0, 1], got {wrong[0]:g}")
-    return values
+    return np.broadcast_to(values, shape)
 
 
 def _normal_images(normals: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
