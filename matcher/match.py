@@ -221,11 +221,8 @@ def _cells(match: Match) -> tuple[str, ...]:
     if match.class_name is None:
         return ("no landmark", "", "", "refused", _number(match.p_value, ".3g"))
     cells = []
-    for name, value, scale, form in (
-        ("distance_m", match.distance_m, 1.0, ".4f"),
-        ("delta_rad", match.delta_rad, 180 / math.pi, ".2f"),
-    ):
-        std = 0.0
+    for name, form in (("distance_m", ".4f"), ("delta_rad", ".2f")):
+        value, scale, std = getattr(match, name), scale_of_degrees(name), 0.0
         if match.accepted and match.covariance is not None and name in match.free:
             k = match.free.index(name)
             std = scale * math.sqrt(max(float(match.covariance[k, k]), 0.0))

@@ -52,10 +52,10 @@ class TerminalView(Sink):
     console : rich.console.Console, optional
     """
 
-    def __init__(self, bank: Bank | None, console: Console | None = None) -> None:
+    def __init__(self, bank: Bank | None) -> None:
         super().__init__("view")
         self._pictures = Pictures(bank)
-        self._screen = Screen(console=console or Console(stderr=True), auto_refresh=False, transient=False)
+        self._screen = Screen(console=Console(stderr=True), auto_refresh=False, transient=False)
         self._screen.start()
         self._next_s, self._line = 0.0, ""
 

@@ -95,10 +95,10 @@ class StandingView(NamedTuple):
 class Stand:
     """A landmark on, or above, a floor: patches, groups of patches, and the transport between them."""
 
-    def __init__(self, mesh: MeshTopology, floor_z_m: float | None, kind: str, wave_numbers: Sequence[float]) -> None:
+    def __init__(self, mesh: MeshTopology, floor_z_m: float | None, wave_numbers: Sequence[float]) -> None:
         topology = _with_floor(mesh, floor_z_m)
         size_at = _sizes(mesh, floor_z_m)
-        self.patches = make_patches(topology, size_at, intersector=kind, before_others=_LANDMARK)
+        self.patches = make_patches(topology, size_at, before_others=_LANDMARK)
         transport = transport_between(self.patches)
         self.slopes = transport.slopes
         self._gather_groups(size_at)
@@ -170,28 +170,18 @@ class StandingLight:
         The camera, with its lamp.
     frequencies_hz : sequence of float
         Of the phasors; 0: of intensities.
-    kind : {"auto", "embree", "float64"}
-        Intersector.
     """
 
-    def __init__(
-        self,
-        mesh: MeshTopology,
-        albedo: float,
-        sensor: Sensor,
-        frequencies_hz: Sequence[float],
-        *,
-        kind: str = "auto",
-    ) -> None:
-        self._mesh, self._albedo, self._sensor, self._kind = mesh, albedo, sensor, kind
+    def __init__(self, mesh: MeshTopology, albedo: float, sensor: Sensor, frequencies_hz: Sequence[float]) -> None:
+        self._mesh, self._albedo, self._sensor = mesh, albedo, sensor
         self._wave_numbers = [2 * math.pi * hz / SPEED_OF_LIGHT_M_S for hz in frequencies_hz]
         self._stands: dict[int | None, Stand] = {}
-        self._stand_key = _mesh_digest(mesh), tuple(self._wave_numbers), kind
+        self._stand_key = _mesh_digest(mesh), tuple(self._wave_numbers)
         self._nodes: dict[tuple[object, ...], tuple[NDArray[np.complex64], NDArray[np.complex64]]] = {}
         self._among: dict[tuple[float, float, float], NDArray[np.float64]] = {}
         self._radius_m = float(np.hypot(*mesh.vertices[:, :2].T).max(initial=0.0))
         self._lock = Lock()
-        self._sampler = SceneMesh.of_surface(mesh, make_intersector(mesh.vertices, mesh.faces, kind), WALL)
+        self._sampler = SceneMesh.of_surface(mesh, make_intersector(mesh.vertices, mesh.faces), WALL)
         self._grid = camera_of(sensor, (0, sensor.rows), ())
         self._least_cosine = math.cos(math.radians(sensor.lamp_half_angle_deg or 0.0))
 
@@ -207,7 +197,7 @@ class StandingLight:
             if key not in self._stands:
                 found = _STANDS.get((key, *self._stand_key))
                 if found is None:
-                    found = Stand(self._mesh, floor_z, self._kind, self._wave_numbers)
+                    found = Stand(self._mesh, floor_z, self._wave_numbers)
                 self._stands[key] = _STANDS[key, *self._stand_key] = found
         return key, self._stands[key]
 

@@ -86,8 +86,41 @@ class DirectFit:
         return poses
 
     def plane_range_m(self, plane: PlaneRecording) -> NDArray[np.float64]:
-        """Return the distance of a plane that each zone's histogram alone tells best, (n, zones)."""
-        return _plane_ranges(self.model, self.parameters, self.responses, plane)
+        """Return the distance of a plane that each zone's histogram alone tells best, (n, zones).
+
+        By weighted least squares about the peak.
+        """
+        model, p, responses = self.model, self.parameters, self.responses
+        unit = PlaneRecording(plane.frames[np.array([0])], np.array([0.5]))
+        light = model.transients(p, unit)[0].sum(axis=0)
+        measured = plane.frames.zone_counts
+        drift = p["reference_gain"] * plane.frames.reference_shift_bins
+        cycles, widths, delays = cycles_of(p), model.bin_widths_m(p), responses.delays
+
+        def best(i: int, zone: int) -> float:
+            lit = light[zone] != 0
+            weight, cumulative = light[zone][lit], responses.cumulative[zone]
+            path_bins = model.axis.nodes_m[lit] / 0.5 / widths[zone]  # for each metre of distance
+            counts = undo_pile_up(measured[i, zone], cycles) - responses.crosstalk[zone]
+            top = int(measured[i, zone].argmax())
+            window = slice(max(top - _RANGE_WINDOW[0], 0), min(top + _RANGE_WINDOW[1], len(counts)))
+            left = np.exp(-np.cumsum(counts + responses.crosstalk[zone]) / cycles)
+            std = np.sqrt(np.maximum(measured[i, zone], 1.0) / left**2 + (0.01 * counts) ** 2)[window]
+            target = (counts - counts[AMBIENT_BINS].mean())[window] / std
+            edges = np.arange(window.start, window.stop + 1)[:, None]
+
+            def misfit(distance: float) -> float:
+                delay = edges - distance * path_bins - drift[i]
+                share = np.interp(delay, delays, cumulative, left=0.0, right=1.0)
+                shape = np.diff(share @ weight, axis=0) / std
+                brightness = float(shape @ target) / max(float(shape @ shape), 1e-300)
+                rest = brightness * shape - target
+                return float(rest @ rest)
+
+            middle = plane.distance_m[i]
+            return float(minimize_scalar(misfit, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x)
+
+        return np.array([[best(i, zone) for zone in range(len(widths))] for i in range(len(plane.frames))])
 
     def centroid_error_m(self, recording: PlaneRecording | ObjectRecording) -> NDArray[np.float64]:
         """Return measured less predicted centroid of the highest peak, metres of range, (n, zones)."""
@@ -279,40 +312,6 @@ def _crosstalk(
         responses.cumulative, responses.first, responses.step, found.range_m / widths, model.histogram.bins
     )
     return found, found.counts * shapes
-
-
-def _plane_ranges(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:
-    """Return each zone's own best distance, by weighted least squares about the peak."""
-    unit = PlaneRecording(plane.frames[np.array([0])], np.array([0.5]))
-    light = model.transients(p, unit)[0].sum(axis=0)
-    measured = plane.frames.zone_counts
-    drift = p["reference_gain"] * plane.frames.reference_shift_bins
-    cycles, widths, delays = cycles_of(p), model.bin_widths_m(p), responses.delays
-
-    def best(i: int, zone: int) -> float:
-        lit = light[zone] != 0
-        weight, cumulative = light[zone][lit], responses.cumulative[zone]
-        path_bins = model.axis.nodes_m[lit] / 0.5 / widths[zone]  # for each metre of distance
-        counts = undo_pile_up(measured[i, zone], cycles) - responses.crosstalk[zone]
-        top = int(measured[i, zone].argmax())
-        window = slice(max(top - _RANGE_WINDOW[0], 0), min(top + _RANGE_WINDOW[1], len(counts)))
-        left = np.exp(-np.cumsum(counts + responses.crosstalk[zone]) / cycles)
-        std = np.sqrt(np.maximum(measured[i, zone], 1.0) / left**2 + (0.01 * counts) ** 2)[window]
-        target = (counts - counts[AMBIENT_BINS].mean())[window] / std
-        edges = np.arange(window.start, window.stop + 1)[:, None]
-
-        def misfit(distance: float) -> float:
-            delay = edges - distance * path_bins - drift[i]
-            share = np.interp(delay, delays, cumulative, left=0.0, right=1.0)
-            shape = np.diff(share @ weight, axis=0) / std
-            brightness = float(shape @ target) / max(float(shape @ shape), 1e-300)
-            rest = brightness * shape - target
-            return float(rest @ rest)
-
-        middle = plane.distance_m[i]
-        return float(minimize_scalar(misfit, bracket=(middle - 0.003, middle + 0.003), tol=1e-7).x)
-
-    return np.array([[best(i, zone) for zone in range(len(widths))] for i in range(len(plane.frames))])
 
 
 def _reduced_chi2(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:

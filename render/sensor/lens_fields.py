@@ -132,7 +132,7 @@ class Lens(FieldTable):
         ValueError
             The lens folds inside the image; with one line.
         """
-        return lens_map(self.model, self.fx, self.fy, self.cx, self.cy, self.distortion, rows, cols)
+        return lens_map(self.model, (self.fx, self.fy, self.cx, self.cy), self.distortion, rows, cols)
 
 
 def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
@@ -157,10 +157,7 @@ def with_geometry_of_lens(data: Mapping[str, Any]) -> dict[str, Any]:
         return fields  # what is wrong about them is found where fields are checked
     centre = (lens.cx + 0.5, lens.cy + 0.5)
     whole = fields.get("whole_image_px")
-    if whole is None or not _is_pair(whole):
-        check_image_size(lens, rows, cols, farthest=_FARTHEST)
-    else:
-        check_image_size(lens, rows, cols, whole)
+    check_image_size(lens, rows, cols, whole if _is_pair(whole) else None, farthest=_FARTHEST)
     try:
         tan_h, tan_v = lens.before(rows, cols).tan_half_angles
     except ValueError as error:

@@ -72,7 +72,7 @@ class LensMap:
     Parameters
     ----------
     model : {"opencv", "fisheye"}
-    fx, fy, cx, cy : float
+    intrinsics : (fx, fy, cx, cy)
         As OpenCV has them, pixels.
     distortion : tuple of float
         In OpenCV's order, at most 8.
@@ -85,21 +85,12 @@ class LensMap:
     """
 
     def __init__(
-        self,
-        model: str,
-        fx: float,
-        fy: float,
-        cx: float,
-        cy: float,
-        distortion: tuple[float, ...],
-        rows: int,
-        cols: int,
+        self, model: str, intrinsics: tuple[float, ...], distortion: tuple[float, ...], rows: int, cols: int
     ) -> None:
         self.model = FISHEYE if model == "fisheye" else OPENCV
         self.k = np.zeros(8)
         self.k[: len(distortion)] = distortion
-        self.focal_px = np.array([fx, fy])
-        self.centre_px = np.array([cx + 0.5, cy + 0.5])
+        self.focal_px, self.centre_px = np.array(intrinsics[:2]), np.array(intrinsics[2:]) + 0.5
         self.rows, self.cols = rows, cols
         self._radius, self._distorted = self._radial_table()
         self.largest_tangent = float(self._radius[-1])
