@@ -20,7 +20,7 @@ _FOLDERS = {
     "matcher/histograms": "histogram_table poisson_fit table_search target_costs",
     "matcher/likelihood": "bank_images residuals strip_images",
     "matcher/locate": "kernel_arguments pose_search scan_rows wall_depths",
-    "matcher/nearest": "bank_minima cell_fits cells search templates",
+    "matcher/nearest": "bank_minima cell_fits cells grid search templates",
     "render": "background compile_cache kernel unwrapping",
     "render/bounces": "form_factors patches transport",
     "render/direct": (

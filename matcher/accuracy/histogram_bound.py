@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
-from phasemark.matcher.histograms.direct_matcher import glass_counts
 from phasemark.matcher.histograms.poisson_fit import sums_of_frame
 from phasemark.matcher.histograms.scene_models import FLOOR, WALL, WALL_STEP_M, planes_of
 from phasemark.matcher.information import eliminated
 from phasemark.render import Background, Views
+from phasemark.render.direct.bin_counts import glass_counts
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_images import HistogramRenderer
 from phasemark.render.direct.view_signals import STEPS

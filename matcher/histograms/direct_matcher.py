@@ -16,7 +16,6 @@ from phasemark.matcher.estimate.acceptance import Rules
 from phasemark.matcher.histograms.histogram_table import TableGrid, plan_table
 from phasemark.matcher.histograms.scene_models import planes_of
 from phasemark.render import Background, Sensor
-from phasemark.render.direct.bin_counts import response_share
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.view_signals import ViewSignals
 from phasemark.render.view import VIEW_FIELDS
@@ -127,10 +126,3 @@ def _view_limits(grid: TableGrid, background: Background | None) -> NDArray[np.f
         low[1], high[1] = grid.delta_rad[0], grid.delta_rad[-1]
     low[4:], high[4:] = -_STEEPEST_RAD, _STEEPEST_RAD
     return np.stack([low, high])
-
-
-def glass_counts(sensor: Sensor) -> NDArray[np.float64]:
-    """Return the expected counts of the cover glass in one frame, (bins,)."""
-    histogram = histogram_of(sensor)
-    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
-    return np.asarray(histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram)))

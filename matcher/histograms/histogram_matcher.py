@@ -11,7 +11,6 @@ from scipy import special
 
 from phasemark.matcher.estimate.acceptance import no_answer
 from phasemark.matcher.histograms.cost_shape import axes_of_parameters, lessened, points_along, principal_axes
-from phasemark.matcher.histograms.direct_matcher import glass_counts
 from phasemark.matcher.histograms.exact_fit import Counted, Fit, Search, Start, fit_view
 from phasemark.matcher.histograms.histogram_search import SCENES, SURE_COST, HistogramSearch
 from phasemark.matcher.histograms.poisson_fit import deviance_of, deviance_test, doubtful_deviance, moments_of
@@ -19,6 +18,7 @@ from phasemark.matcher.histograms.scene_models import JointModel, view_from
 from phasemark.matcher.histograms.view_answers import Explanation, FitTest, answer_from
 from phasemark.matcher.match import Match
 from phasemark.render import Background
+from phasemark.render.direct.bin_counts import glass_counts
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.threads import mapped

@@ -15,7 +15,6 @@ from phasemark.matcher.histograms.exact_fit import Counted, Fit, Search, Start, 
 from phasemark.matcher.histograms.histogram_table import (
     Table,
     build_table,
-    cubic,
     plane_light,
     response_width_m,
     signal_between,
@@ -23,6 +22,7 @@ from phasemark.matcher.histograms.histogram_table import (
 from phasemark.matcher.histograms.poisson_fit import bare_deviance
 from phasemark.matcher.histograms.scene_models import FAINTEST, STRONGEST, LandmarkModel, planes_of
 from phasemark.matcher.histograms.table_search import DESCENT_MARGIN, ambient_light, find_hills, find_hills_before
+from phasemark.matcher.nearest.grid import cubic_weights
 from phasemark.render import Background
 from phasemark.render.direct.fit_model import undo_pile_up
 from phasemark.render.view import VIEW_FIELDS
@@ -59,8 +59,8 @@ class TableModel:
         x, y = (state[:2] - table.grid[::2]) / table.grid[1::2]
         i = min(max(math.floor(x), 1), n_distance - 3)
         j = math.floor(y) if table.cyclic else min(max(math.floor(y), 1), n_delta - 3)
-        cubic(x - i, nodes[0], nodes[1])
-        cubic(y - j, nodes[2], nodes[3])
+        cubic_weights(x - i, nodes[0], nodes[1])
+        cubic_weights(y - j, nodes[2], nodes[3])
         about = visible[i - 1 : i + 3][:, np.arange(j - 1, j + 3) % n_delta].astype(np.float64)
         weights = (nodes[0], nodes[2]), (nodes[1] / table.grid[1], nodes[2]), (nodes[0], nodes[3] / table.grid[3])
         shown, *slopes = (np.einsum("a,b,abpz->pz", *pair, about)[..., None] * self._light for pair in weights)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.histograms.scene_models import planes_of
+from phasemark.matcher.nearest.grid import cubic_weights
 from phasemark.render import Background, Sensor, Views
 from phasemark.render.direct.footprints import histogram_of
 from phasemark.render.direct.view_signals import ViewSignals
@@ -208,19 +209,6 @@ def _window(
 
 
 @kernel
-def cubic(f, weight, slope):  # type: ignore[no-untyped-def]
-    """Fill Lagrange weights and their slopes for a place between the second and the third of four nodes."""
-    weight[0] = -f * (f - 1) * (f - 2) / 6
-    weight[1] = (f + 1) * (f - 1) * (f - 2) / 2
-    weight[2] = -(f + 1) * f * (f - 2) / 2
-    weight[3] = (f + 1) * f * (f - 1) / 6
-    slope[0] = -(3 * f * f - 6 * f + 2) / 6
-    slope[1] = (3 * f * f - 4 * f - 1) / 2
-    slope[2] = -(3 * f * f - 2 * f - 2) / 2
-    slope[3] = (3 * f * f - 1) / 6
-
-
-@kernel
 def signal_between(table, c, distance, delta, nodes, out):  # type: ignore[no-untyped-def]
     """Fill signal and slopes by distance and δ at a view, (3, zones, bins); returns first and last bin that is lit.
 
@@ -239,12 +227,12 @@ def signal_between(table, c, distance, delta, nodes, out):  # type: ignore[no-un
     n_bins = out.shape[2]
     x = (distance - table.grid[0]) / table.grid[1]
     i = min(max(math.floor(x), 1), n_distance - 3)
-    cubic(x - i, nodes[0], nodes[1])
+    cubic_weights(x - i, nodes[0], nodes[1])
     y = (delta - table.grid[2]) / table.grid[3]
     j = math.floor(y)
     if not table.cyclic:
         j = min(max(j, 1), n_delta - 3)
-    cubic(y - j, nodes[2], nodes[3])
+    cubic_weights(y - j, nodes[2], nodes[3])
     start = max(table.first_bin[i - 1], 0)
     stop = min(table.first_bin[i + 2] + width, n_bins)
     for z in range(n_zones):

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from phasemark.data import Bank
 from phasemark.data.bank.bank_file import BankGroup
 from phasemark.matcher.likelihood.images import VIEW, ImageModel, ModelImages
-from phasemark.matcher.nearest.grid import closing_period
+from phasemark.matcher.nearest.grid import closing_period, cubic_weights
 from phasemark.render import PhasorImages
 
 _STRAIGHT = 2e-3
@@ -191,19 +191,6 @@ def _steps_around(angle, first, step, n, closes):  # type: ignore[no-untyped-def
     return x - n * np.floor(x / n) if closes else x
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _cubic(t, w, dw):  # type: ignore[no-untyped-def]
-    """Fill the weights of the cubic through four neighbours at −1, 0, 1, 2, and their derivatives."""
-    w[0] = -t * (t - 1) * (t - 2) / 6
-    w[1] = (t + 1) * (t - 1) * (t - 2) / 2
-    w[2] = -(t + 1) * t * (t - 2) / 2
-    w[3] = (t + 1) * t * (t - 1) / 6
-    dw[0] = -(3 * t * t - 6 * t + 2) / 6
-    dw[1] = (3 * t * t - 4 * t - 1) / 2
-    dw[2] = -(3 * t * t - 2 * t - 2) / 2
-    dw[3] = (3 * t * t - 1) / 6
-
-
 _vectorised = njit(cache=True, nogil=True, error_model="numpy", fastmath=True)
 
 
@@ -328,8 +315,8 @@ def interpolate(  # type: ignore[no-untyped-def]
     for m in range(len(class_index)):
         i0, td = _cell((view[m, 0] - first_d) / step_d, n_d, False)
         j0, ta = _cell(_steps_around(view[m, 1], first_a, step_a, n_a, closes), n_a, closes)
-        _cubic(td, wd, dwd)
-        _cubic(ta, wa, dwa)
+        cubic_weights(td, wd, dwd)
+        cubic_weights(ta, wa, dwa)
         dwd /= step_d
         dwa /= step_a
         k, d = _straight_cell(td)

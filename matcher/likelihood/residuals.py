@@ -268,13 +268,8 @@ def _sum_ranges(  # type: ignore[no-untyped-def]
     phasor, slope, value, weight, frame, use, metres_per_radian, huber, cost, capped, gradient, information
 ):
     m, p, pixels = slope.shape
-    rows, residual, weights, picked = (
-        np.empty((p, pixels)),
-        np.empty(pixels),
-        np.empty(pixels),
-        np.empty(pixels, np.int64),
-    )
-    share = np.empty(pixels)
+    rows, picked = np.empty((p, pixels)), np.empty(pixels, np.int64)
+    residual, weights, share = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for k in range(m):
         f, n = frame[k], 0
         for q in range(pixels):

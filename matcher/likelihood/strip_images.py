@@ -54,10 +54,8 @@ class StripModel(ImageModel):
         sensor = bank.sensor
         self._strips = strips = _strip_sensor(sensor, widest_columns)
         self._period = closing_period(bank.delta_rad)
-        self._distance, self._delta = (
-            _axis(bank.distance_m, _STEP_M),
-            _axis(bank.delta_rad, _STEPS_RAD[_is_wide(sensor)], self._period),
-        )
+        self._distance = _axis(bank.distance_m, _STEP_M)
+        self._delta = _axis(bank.delta_rad, _STEPS_RAD[_is_wide(sensor)], self._period)
         meshes = [bank.mesh(name) for name in bank.classes]
         self._renderers = [Renderer(mesh, strips, albedo=float(mesh.metadata["albedo"])) for mesh in meshes]
         middle = strips.lower_rows[0] if bank.lower is not None else 0
@@ -379,8 +377,6 @@ def _images(  # type: ignore[no-untyped-def]
                     high = min(v1, r + 1.0) - max(v0, float(r))
                     come, leave = _at(strips, r * cols, box, u1), _at(strips, r * cols, box, u0)
                     by_bearing += high * (move1 * come - move0 * leave)
-                slope[k, 0, p], slope[k, 1, p] = (
-                    complex(slopes[0], slopes[1]) * area,
-                    complex(slopes[2], slopes[3]) * area,
-                )
+                slope[k, 0, p] = complex(slopes[0], slopes[1]) * area
+                slope[k, 1, p] = complex(slopes[2], slopes[3]) * area
                 slope[k, 2, p] = (by_bearing - light * (move1 - move0) / (u1 - u0)) * area

@@ -49,7 +49,6 @@ class TerminalView(Sink):
     ----------
     bank : Bank or None
         Landmarks that are rendered; None of a rig among walls.
-    console : rich.console.Console, optional
     """
 
     def __init__(self, bank: Bank | None) -> None:

@@ -85,9 +85,9 @@ def predict(theta: _Float, scan: Scan, rig: RigNumbers, outline: Outline, out: P
             poses[k, 2] = body + rig.yaw_rad[s] + theta[N_BODY + sensors + s]
             of[k] = s
     depth, spread = out.depth_m.reshape(n, columns), out.spread_m.reshape(n, columns)
-    slope, share = np.empty((n, columns, N_SLOPES)), np.empty((n, columns))
+    slope = np.empty((n, columns, N_SLOPES))
     of_walls = out.wall_slope.reshape(out.wall_slope.shape[0] * sensors, columns, out.wall_slope.shape[3])
-    column_depths(poses, of, outline, rig.step_rad, rig.columns, rig.footprint, depth, slope, of_walls, spread, share)
+    column_depths(poses, of, outline, rig, depth, slope, of_walls, spread)
     for k in range(n):
         f, s = k // sensors, k % sensors
         cos_s, sin_s = np.cos(poses[k, 2]), np.sin(poses[k, 2])

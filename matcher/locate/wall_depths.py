@@ -16,7 +16,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from phasemark.matcher.locate.kernel_arguments import Outline
+from phasemark.matcher.locate.kernel_arguments import Outline, RigNumbers
+
+_Float = NDArray[np.float64]
 
 _NEAREST_M = 1e-3
 """A wall is cut off at this depth."""
@@ -28,18 +30,9 @@ N_SLOPES = 4
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def column_depths(
-    poses: NDArray[np.float64],
-    sensor: NDArray[np.int64],
-    outline: Outline,
-    step_rad: NDArray[np.float64],
-    columns: NDArray[np.int64],
-    footprint: NDArray[np.float64],
-    depth_m: NDArray[np.float64],
-    slope: NDArray[np.float64],
-    wall_slope: NDArray[np.float64],
-    spread_m: NDArray[np.float64],
-    share: NDArray[np.float64],
-) -> None:
+    poses: _Float, sensor: NDArray[np.int64], outline: Outline, rig: RigNumbers,
+    depth_m: _Float, slope: _Float, wall_slope: _Float, spread_m: _Float,
+) -> None:  # fmt: skip
     """Compute the depth of each column at poses of sensors, with its slopes.
 
     Parameters
@@ -49,12 +42,8 @@ def column_depths(
     sensor : (n,) int64
         Which sensor each pose is of.
     outline : Outline
-    step_rad : (S,) float64
-        Angle between neighbouring columns; column 0 is the leftmost.
-    columns : (S,) int64
-        Number of columns.
-    footprint : (S,) float64
-        Base of the triangle, in columns.
+    rig : RigNumbers
+        Columns of the sensors, column 0 the leftmost, and their footprints.
     depth_m : (n, C) float64
         Result: mean distance along the boresight, weighted with light; NaN where no wall is seen, and of columns a
         sensor does not have.
@@ -64,8 +53,6 @@ def column_depths(
         Result: by the displacement of each wall; of no pose (0, C, w): not computed.
     spread_m : (n, C) float64
         Result: standard deviation of the depth within the footprint.
-    share : (n, C) float64
-        Result: share of the footprint on walls.
     """
     pieces, wall, normal, with_walls = outline.pieces, outline.wall, outline.normal, len(wall_slope) > 0
     m, most = len(pieces), depth_m.shape[1]
@@ -79,10 +66,10 @@ def column_depths(
     for k in range(len(poses)):
         s = sensor[k]
         first, last = np.inf, -np.inf
-        n = columns[s]
+        n, step_rad, footprint = rig.columns[s], rig.step_rad[s], rig.footprint[s]
         for c in range(n):
-            centre[c] = np.tan((0.5 * (n - 1) - c) * step_rad[s])
-            width[c] = 0.5 * footprint[s] * abs(step_rad[s]) * (1 + centre[c] ** 2)
+            centre[c] = np.tan((0.5 * (n - 1) - c) * step_rad)
+            width[c] = 0.5 * footprint * abs(step_rad) * (1 + centre[c] ** 2)
             first, last = min(first, centre[c] - width[c]), max(last, centre[c] + width[c])
         x, y, cos, sin = poses[k, 0], poses[k, 1], np.cos(poses[k, 2]), np.sin(poses[k, 2])
         seen, ends = 0, 2
@@ -121,7 +108,6 @@ def column_depths(
         depth_m[k] = np.nan
         slope[k] = 0.0
         spread_m[k] = 0.0
-        share[k] = 0.0
         if with_walls:
             wall_slope[k] = 0.0
         before = -1
@@ -191,7 +177,6 @@ def column_depths(
                             wall_slope[k, c, e] -= light * z * away
                             light_of_walls[c, e] -= 2 * light * away
         for c in range(n):
-            share[k, c] = hits[c]
             if hits[c] < 1e-6:
                 continue
             light = total[c, 0]

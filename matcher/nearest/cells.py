@@ -110,10 +110,8 @@ class CellBounds:
     ) -> None:
         self._only = only
         self.closes = closing_period(bank.delta_rad) is not None
-        centres = (
-            _centres(len(bank.distance_m), stride[0], False),
-            _centres(len(bank.delta_rad), stride[1], self.closes),
-        )
+        along, around = len(bank.distance_m), len(bank.delta_rad)
+        centres = _centres(along, stride[0], False), _centres(around, stride[1], self.closes)
         self.distance_m, self.delta_rad = bank.distance_m[centres[0]], bank.delta_rad[centres[1]]
         self._period_m = bank.sensor.unambiguous_range_m
         cols = bank.sensor.cols
@@ -220,12 +218,8 @@ def _cells_of_group(
     """Return the cells of a group of a bank, (class, D, δ, pixels) with all but the pixels flattened."""
     has_class, has_delta = len(group.n_views) == 3 or seen.rows[0] == 0, group.n_views[-1] == len(bank.delta_rad)
     has_delta = has_delta and group is not bank.upper
-    reach, n_d, cols, period_m = (
-        (stride[0] + 1) // 2,
-        len(bank.distance_m),
-        bank.sensor.cols,
-        bank.sensor.unambiguous_range_m,
-    )
+    reach, n_d = (stride[0] + 1) // 2, len(bank.distance_m)
+    cols, period_m = bank.sensor.cols, bank.sensor.unambiguous_range_m
     n_class, n_a = len(bank.classes) if has_class else 1, len(centres[1]) if has_delta else 1
     shape = n_class * len(centres[0]) * n_a, (seen.rows[1] - seen.rows[0]) * cols
     found = Cells(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))

@@ -1,4 +1,4 @@
-"""The grid of a bank: over which period its angles close, and which views are in its range."""
+"""The grid of a bank: over which period its angles close, which views are in its range, and what lies between nodes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
+
+from phasemark.render.kernel import kernel
 
 CELL_M, CELL_RAD = 0.02, math.radians(2.0)
 """Cells of the search: as large as they may be for most of what a pixel shows to change little within them."""
@@ -45,3 +47,16 @@ def closing_period(delta_rad: NDArray[np.float64]) -> float | None:
     step = float(delta_rad[1] - delta_rad[0])
     turns = 2 * np.pi / (delta_rad[-1] - delta_rad[0] + step)
     return float(2 * np.pi / round(turns)) if round(turns) >= 1 and abs(turns - round(turns)) < 1e-6 else None
+
+
+@kernel
+def cubic_weights(f, weight, slope):  # type: ignore[no-untyped-def]
+    """Fill Lagrange weights and their slopes for a place between the second and the third of four nodes."""
+    weight[0] = -f * (f - 1) * (f - 2) / 6
+    weight[1] = (f + 1) * (f - 1) * (f - 2) / 2
+    weight[2] = -(f + 1) * f * (f - 2) / 2
+    weight[3] = (f + 1) * f * (f - 1) / 6
+    slope[0] = -(3 * f * f - 6 * f + 2) / 6
+    slope[1] = (3 * f * f - 4 * f - 1) / 2
+    slope[2] = -(3 * f * f - 2 * f - 2) / 2
+    slope[3] = (3 * f * f - 1) / 6

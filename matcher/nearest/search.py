@@ -26,6 +26,7 @@ _REACH_M, _REACH_RAD = 0.01, math.radians(5)
 _WIDE_REACH_M, _WIDE_REACH_RAD = 0.03, math.radians(12)
 """The same before a background, where mixed pixels count and the ripples are wider."""
 _N_STARTS = 6
+"""Minima of the thinned grid from which descents start."""
 
 
 class ExactSearch:
@@ -65,8 +66,6 @@ class PrunedSearch:
         Every how many steps the thinned grid has a point.
     reach : (distance, δ)
         How many steps a descent looks to either side.
-    n_starts : int
-        From how many minima of the thinned grid a descent starts.
     """
 
     def __init__(
@@ -76,12 +75,10 @@ class PrunedSearch:
         delta_rad: NDArray[np.float64],
         stride: tuple[int, int],
         reach: tuple[int, int],
-        n_starts: int = _N_STARTS,
     ) -> None:
         self._templates = templates
         self._shape = len(distance_m), len(delta_rad)
         self._closes = closing_period(delta_rad) is not None
-        self._n_starts = n_starts
         self._reach = reach
         self._i, self._j = (np.arange(0, n, k) for n, k in zip(self._shape, stride, strict=True))
         block = np.arange(math.prod(self._shape)).reshape(self._shape)[:: stride[0], :: stride[1]].ravel()
@@ -90,21 +87,15 @@ class PrunedSearch:
     def nearest(self, seen: Observation, block: int = 0) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the lowest end of the descents that start at the lowest minima of the thinned grid, and its cost."""
         t = self._templates
-        shape = len(seen.range_m), 1, len(self._i), len(self._j)
         size = math.prod(self._shape)
         picked = slice(block * size, (block + 1) * size)
+        thin = self._thin[block].costs(seen).reshape(-1, 1, len(self._i), len(self._j))
+        frames = t.about(seen), seen.weight, DISAGREEMENT * seen.returned, DISAGREEMENT * seen.not_returned
+        model = t.range_m[picked], t.may_return[picked], t.must_return[picked]
         found, cost = _descend(
-            self._thin[block].costs(seen).reshape(shape),
-            self._n_starts,
-            self._i,
-            self._j,
-            self._shape[1],
-            self._closes,
-            self._reach,
-            (t.about(seen), seen.weight, DISAGREEMENT * seen.returned, DISAGREEMENT * seen.not_returned),
-            (t.range_m[picked], t.may_return[picked], t.must_return[picked]),
+            thin, _N_STARTS, self._i, self._j, self._shape[1], self._closes, self._reach, frames, model,
             t.sensor.unambiguous_range_m,
-        )
+        )  # fmt: skip
         return found + picked.start, cost
 
 

@@ -232,11 +232,6 @@ def _extent(topology: MeshTopology) -> float:
     return float((topology.high - topology.low).max())
 
 
-def _longest(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the longest edge of each triangle."""
-    return np.asarray(np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).max(axis=1))
-
-
 def _halved(triangles: NDArray[np.float64], face: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Cut each triangle in two across its longest edge."""
     edge = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).argmax(axis=1)
@@ -259,7 +254,7 @@ def _cut(
     done: list[tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]] = []
     while len(triangles) or not done:
         sizes = size_at(triangles.mean(axis=1), own)
-        longest = _longest(triangles)
+        longest = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2).max(axis=1)
         edges = triangles[:, 1:] - triangles[:, :1]
         thin = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) < _THIN * longest**2
         long = longest > np.where(thin, _SHORTER, 1.0) * sizes

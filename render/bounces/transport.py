@@ -141,16 +141,9 @@ def transport_between(patches: Patches) -> Transport:
         visible = _visible(patches, geometry, one[:m], other[:m], far[:m])
         kept = visible > 0
         sloping = near[:m_near][kept[near[:m_near]]]
-        found.append(
-            (
-                one[:m][kept],
-                other[:m][kept],
-                factor[:m][kept] * visible[kept, None],
-                way[:m][kept],
-                pairs + (np.cumsum(kept) - 1)[sloping],
-                moment[:m_near][kept[near[:m_near]]] * visible[sloping, None, None],
-            )
-        )
+        of_pairs = one[:m][kept], other[:m][kept], factor[:m][kept] * visible[kept, None], way[:m][kept]
+        moments = moment[:m_near][kept[near[:m_near]]] * visible[sloping, None, None]
+        found.append((*of_pairs, pairs + (np.cumsum(kept) - 1)[sloping], moments))
         pairs += int(kept.sum())
     i, j, factors, ways, sloping, moments = (np.concatenate(column) for column in zip(*found, strict=True))
     received = np.bincount(i, factors[:, 0], n) + np.bincount(j, factors[:, 1], n)
@@ -262,11 +255,9 @@ def _form_factors(start, stop, geometry, polygons, one, other, factor, way, far,
                             square = 0.0
                             for axis in range(3):
                                 square += (points[i, k, axis] - points[j, m, axis]) ** 2
-                            total, first, second = (
-                                total + pair,
-                                first + pair * math.sqrt(square),
-                                second + pair * square,
-                            )
+                            total += pair
+                            first += pair * math.sqrt(square)
+                            second += pair * square
             if total == 0.0:
                 continue
             one[count], other[count], far[count] = i, j, distance > _NEAR * reach

@@ -180,9 +180,15 @@ def detected_counts(signal: NDArray[np.float64], sensor: Sensor) -> NDArray[np.f
     histogram = histogram_of(sensor)
     counts = signal + histogram.cycles * (histogram.ambient + histogram.dark)
     if histogram.crosstalk > 0:
-        edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
-        counts += histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram))
+        counts += glass_counts(sensor)
     return piled_up(counts, histogram.cycles) if histogram.pile_up else counts
+
+
+def glass_counts(sensor: Sensor) -> NDArray[np.float64]:
+    """Return the expected counts of the cover glass in one frame, (bins,)."""
+    histogram = histogram_of(sensor)
+    edges = histogram.start_m + histogram.bin_width_m * np.arange(histogram.bins + 1)
+    return np.asarray(histogram.crosstalk * np.diff(response_share(edges - histogram.crosstalk_range_m, histogram)))
 
 
 def piled_up(counts: NDArray[np.float64], cycles: float) -> NDArray[np.float64]:

@@ -191,7 +191,7 @@ class FitModel:
         cycles = cycles_of(p)
         counts = responses.counts_beside_crosstalk(measured, cycles)
         ambient = counts[..., AMBIENT_BINS].mean(axis=-1, keepdims=True)
-        window = signal_window(measured)
+        window = about_peak(measured, 8, 25)
         bright = np.where(window, counts - ambient, 0).sum(axis=-1) / np.maximum(
             np.where(window, shape, 0).sum(axis=-1), 1e-300
         )
@@ -242,21 +242,18 @@ def tolerance(counts: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.sqrt(np.maximum(counts, 1.0) + (FLOOR * counts) ** 2 + (PEAK_FLOOR * peak) ** 2))
 
 
-def signal_window(counts: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which bins hold signal: from 8 before the highest to 24 behind it, (n, zones, bins)."""
-    top = counts.argmax(axis=-1)[..., None]
-    j = np.arange(counts.shape[-1])
-    return np.asarray((j >= top - 8) & (j <= top + 24))
+def about_peak(counts: NDArray[np.float64], before: int, stop: int) -> NDArray[np.bool_]:
+    """Return which bins lie about the highest one of each histogram: from some before it, to a stop behind it."""
+    top, j = counts.argmax(axis=-1)[..., None], np.arange(counts.shape[-1])
+    return np.asarray((j >= top - before) & (j < top + stop))
 
 
-def peak_centroids(counts: NDArray[np.float64], before: int = 3, behind: int = 8) -> NDArray[np.float64]:
+def peak_centroids(counts: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the centroid of each histogram about its highest bin, bins; (..., bins) to (...)."""
     level = counts[..., AMBIENT_BINS].mean(axis=-1, keepdims=True)
-    top = counts.argmax(axis=-1)[..., None]
-    j = np.arange(counts.shape[-1])
-    signal = np.where((j >= top - before) & (j < top + behind), np.maximum(counts - level, 0), 0)
+    signal = np.where(about_peak(counts, 3, 8), np.maximum(counts - level, 0), 0)
     total = signal.sum(axis=-1)
-    return np.asarray((signal @ j) / np.where(total > 0, total, 1))
+    return np.asarray((signal @ np.arange(counts.shape[-1])) / np.where(total > 0, total, 1))
 
 
 @kernel

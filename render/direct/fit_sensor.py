@@ -26,6 +26,7 @@ from phasemark.render.direct.fit_model import (
     Parameters,
     Prediction,
     Responses,
+    about_peak,
     cycles_of,
     peak_centroids,
     start_parameters,
@@ -317,9 +318,7 @@ def _crosstalk(
 def _reduced_chi2(model: FitModel, p: Parameters, responses: Responses, plane: PlaneRecording) -> NDArray[np.float64]:
     """Return χ²/ν of each zone before the plane, with Poisson noise alone."""
     got = model.predict(p, responses, plane)
-    top = got.measured.argmax(axis=-1)[..., None]
-    j = np.arange(got.measured.shape[-1])
-    window = (j >= top - _RANGE_WINDOW[0]) & (j < top + _RANGE_WINDOW[1])
+    window = about_peak(got.measured, *_RANGE_WINDOW)
     chi2 = np.where(window, (got.measured - got.expected) ** 2 / np.maximum(got.expected, 1.0), 0).sum(axis=(0, 2))
     return np.asarray(chi2 / np.maximum(window.sum(axis=(0, 2)) - 2 * len(got.measured), 1))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -80,18 +80,9 @@ class Assembly:
         other._facets = None
         other._moving, other._curves = self._moving.copy(), dict(self._curves)
         other._poses, other._bounds = self._poses.copy(), self._bounds.copy()
-        base = self._base
-        other._base = base._replace(
-            vertices=base.vertices.copy(),
-            planes=base.planes.copy(),
-            corner_normals=in_lines(base.corner_normals),
-            search=in_lines(base.search),
-            smooth_planes=base.smooth_planes.copy(),
-            clusters=base.clusters.copy(),
-            quadrics=base.quadrics.copy(),
-            curves=base.curves.copy(),
-            balls=base.balls.copy(),
-        )
+        placed = _Placed.of(self._base)
+        lines = {name: in_lines(getattr(placed, name)) for name in ("corner_normals", "search")}
+        other._base = self._base._replace(**{name: own.copy() for name, own in placed._asdict().items()} | lines)
         return other
 
     def place(self, body2world: NDArray[np.float64]) -> None:
@@ -171,27 +162,22 @@ class Assembly:
         patches = np.cumsum([0, *(int(mesh.patch.max()) + 1 for mesh in own)])
         alone = len(own) == 1 and np.array_equal(self._poses[0], np.eye(4))
         return MeshTopology(
+            **_end_to_end(own, ("flat", "plain", "albedo", "gloss", "closed", "concave")),
             vertices=np.empty((first.vertex[-1], 3)),
             faces=np.ascontiguousarray(np.concatenate(faces), np.int32),
             planes=np.empty((n_faces, 4)),
             corner_normals=in_lines(np.zeros((n_faces, 9))),
-            flat=np.concatenate([mesh.flat for mesh in own]),
-            plain=np.concatenate([mesh.plain for mesh in own]),
             patch=np.concatenate([mesh.patch + patches[b] for b, mesh in enumerate(own)]).astype(np.int32),
             # the grid of a search does not turn with its faces
             searched=own[0].searched if alone else np.zeros(n_faces, np.bool_),
             search=in_lines(np.concatenate([mesh.search for mesh in own])),
             grid=own[0].grid if alone else _NO_GRID,
             part=np.repeat(np.arange(len(own)), np.diff(first.face)).astype(np.int32),
-            albedo=np.concatenate([mesh.albedo for mesh in own]),
-            gloss=np.concatenate([mesh.gloss for mesh in own]),
             quadric=np.concatenate(
                 [np.where(mesh.quadric >= 0, mesh.quadric + first.quadric[b], -1) for b, mesh in enumerate(own)]
             ).astype(np.int32),
             quadrics=np.empty((first.quadric[-1], 10)),
-            closed=np.concatenate([mesh.closed for mesh in own]),
             creases=np.ascontiguousarray(np.concatenate(creases), np.int32),
-            concave=np.concatenate([mesh.concave for mesh in own]),
             folds=np.ascontiguousarray(np.concatenate(folds), np.int32),
             first_fold=np.append(np.concatenate(begins), first.fold[-1]).astype(np.int32),
             smooth_planes=np.empty((6, n_smooth)),
@@ -207,12 +193,7 @@ class Assembly:
 
     def _turn(self, moved: NDArray[np.int64]) -> None:
         """Write the arrays of bodies that moved, and find where they cross others."""
-        mesh = self._base
-        placed = _Placed(
-            mesh.vertices, mesh.planes, mesh.corner_normals, mesh.search, mesh.smooth_planes, mesh.clusters,
-            mesh.quadrics, mesh.curves, mesh.balls,
-        )  # fmt: skip
-        _turn_bodies(moved, self._poses, self._first, self._frames, placed, self._bounds)
+        _turn_bodies(moved, self._poses, self._first, self._frames, _Placed.of(self._base), self._bounds)
         if self._crosses:
             self._cross(moved)
         self.topology = self._with_curves()
@@ -320,28 +301,24 @@ class _Mover(NamedTuple):
     radius_m: float
 
 
-class _NearestOf:
+class _NearestOf(NamedTuple):
     """Finds the first face among triangles that stand still, those of bodies that move, and solids."""
 
-    def __init__(
-        self,
-        mesh: MeshTopology,
-        numbers: NDArray[np.int64],
-        still: Intersector,
-        movers: Sequence[_Mover],
-    ) -> None:
-        self._mesh, self._numbers, self._still, self._movers = mesh, numbers, still, movers
+    mesh: MeshTopology
+    numbers: NDArray[np.int64]
+    still: Intersector
+    movers: Sequence[_Mover]
 
     def first_face(self, origins: NDArray[np.float32], directions: NDArray[np.float32]) -> NDArray[np.int32]:
         """Return the number of the first face met by each ray, −1 where none is."""
-        n, mesh = len(origins), self._mesh
+        n, mesh = len(origins), self.mesh
         found, distance = np.full(n, -1, np.int32), np.full(n, np.inf)
-        if len(self._numbers):
-            faces = self._still.first_face(origins, directions)
-            _keep_nearer(mesh.planes, self._numbers, faces, np.arange(n), origins, directions, found, distance)
-        if self._movers:
+        if len(self.numbers):
+            faces = self.still.first_face(origins, directions)
+            _keep_nearer(mesh.planes, self.numbers, faces, np.arange(n), origins, directions, found, distance)
+        if self.movers:
             rays, own_origins, own_directions = np.arange(n), np.empty_like(origins), np.empty_like(directions)
-        for mover in self._movers:
+        for mover in self.movers:
             count = _aimed_at(
                 mover.centre, mover.radius_m, mover.pose, origins, directions, rays, own_origins, own_directions
             )
@@ -410,17 +387,19 @@ class _Placed(NamedTuple):
     @classmethod
     def joined(cls, own: Sequence[MeshTopology], balls: NDArray[np.float64]) -> _Placed:
         """Join the arrays of bodies, each in its own frame."""
-        return cls(
-            np.concatenate([mesh.vertices for mesh in own]),
-            np.concatenate([mesh.planes for mesh in own]),
-            np.concatenate([mesh.corner_normals for mesh in own]),
-            np.concatenate([mesh.search for mesh in own]),
-            _with_solids_numbered([mesh.smooth_planes for mesh in own]),
-            np.concatenate([mesh.clusters for mesh in own]),
-            np.concatenate([mesh.quadrics for mesh in own]),
-            np.concatenate([mesh.curves for mesh in own]),
-            balls,
-        )
+        names = [name for name in cls._fields if name not in ("smooth_planes", "balls")]
+        smooth_planes = _with_solids_numbered([mesh.smooth_planes for mesh in own])
+        return cls(**_end_to_end(own, names), smooth_planes=smooth_planes, balls=balls)
+
+    @classmethod
+    def of(cls, mesh: MeshTopology) -> _Placed:
+        """Return those arrays of a surface."""
+        return cls(*(getattr(mesh, name) for name in cls._fields))
+
+
+def _end_to_end(own: Sequence[MeshTopology], names: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """Return some arrays of bodies, by name, those of one body behind those of the one before."""
+    return {name: np.concatenate([getattr(mesh, name) for mesh in own]) for name in names}
 
 
 def _with_solids_numbered(planes: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:
@@ -604,20 +583,12 @@ class _Firsts(NamedTuple):
     @classmethod
     def of(cls, own: Sequence[MeshTopology], solids: Sequence[Solid | None]) -> _Firsts:
         """Count the arrays of bodies."""
-        counts = [
-            (
-                len(mesh.vertices),
-                len(mesh.faces),
-                mesh.smooth_planes.shape[1],
-                len(mesh.folds),
-                len(mesh.clusters),
-                len(mesh.quadrics),
-                len(mesh.curves),
-                0 if solid is None else len(solid.balls),
-            )
-            for mesh, solid in zip(own, solids, strict=True)
-        ]
-        return cls(*np.ascontiguousarray(np.cumsum([(0,) * 8, *counts], axis=0).T))
+        counts = [[0] * len(cls._fields)]
+        for mesh, solid in zip(own, solids, strict=True):
+            smooth, balls = mesh.smooth_planes.T, () if solid is None else solid.balls
+            arrays = (mesh.vertices, mesh.faces, smooth, mesh.folds, mesh.clusters, mesh.quadrics, mesh.curves, balls)
+            counts.append([len(array) for array in arrays])
+        return cls(*np.ascontiguousarray(np.cumsum(counts, axis=0).T))
 
 
 def _solids(bodies: Sequence[Body]) -> list[Solid | None]:
