@@ -25,7 +25,7 @@ from phasemark.matcher.filters.filtered_frames import noise_free
 from phasemark.matcher.likelihood.systematic import calibrated_slopes
 from phasemark.render import Frames, Renderer, Sensor, Views, capture
 from phasemark.render.sensor import Lens
-from phasemark.render.sensor.lens_rates import lens_rates
+from phasemark.render.sensor.lens_fields import lens_rates
 from phasemark.render.sensor.region import Region
 from phasemark.render.sensor.sensor_file import sensor_toml
 

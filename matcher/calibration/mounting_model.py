@@ -24,9 +24,8 @@ from phasemark.matcher.likelihood.residuals import Evidence, ResidualKind
 from phasemark.matcher.one_frequency import OneFrequency, OneFrequencyRenderer
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
 from phasemark.render.direct.chip_renderer import ChipRenderer
-from phasemark.render.sensor.lens_fields import TERMS
+from phasemark.render.sensor.lens_fields import TERMS, lens_rates
 from phasemark.render.sensor.lens_map import distort
-from phasemark.render.sensor.lens_rates import lens_rates
 from phasemark.render.threads import mapped
 from phasemark.render.view import VIEW_FIELDS
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from phasemark import UsageError
 from phasemark.render import Background, PhasorImages, Renderer, Sensor, Views
-from phasemark.render.sensor.lens_fields import LENS_FIELD
-from phasemark.render.sensor.lens_rates import lens_rates
+from phasemark.render.sensor.lens_fields import LENS_FIELD, lens_rates
 
 Systematic = Literal["calibration", "recording", "declared", "multipath", "motion"]
 """What a calibration leaves of the sensor's fields, what differs in another recording, what the sensor declares of a

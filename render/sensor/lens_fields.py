@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from phasemark import UsageError
 from phasemark.inputs.field_table import FieldTable
-from phasemark.render.sensor.lens_map import LensMap, lens_map
+from phasemark.render.sensor.lens_map import LensMap, distort, lens_map
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -36,6 +36,8 @@ _MOST_PIXELS = 4096  # along a side of an image
 _OFF_CENTRE = 0.4  # of the image's size, how far from its centre the principal point of a whole image may lie
 _FARTHEST = 1.0  # the same of a camera that may read a part of an image
 _MOST_STEPS = 30
+_POINTS = 9  # along each side of the image at which its motion is asked
+_STEP = 1e-30  # of a complex derivative
 _SAME = 1e-5  # relative difference up to which a stated field agrees with the lens
 
 DERIVED = ("half_angle_h_deg", "half_angle_v_deg", "principal_point_px")
@@ -253,6 +255,41 @@ def changed_lens(lens: Lens, rows: int, cols: int, changes: Mapping[str, Any]) -
                 break
             lens = lens.with_terms(**{focal: getattr(lens, focal) * ratio})
     return lens
+
+
+def lens_rates(lens: Lens, rows: int, cols: int) -> dict[str, float]:
+    """Return by how much a unit of each term moves the image point that it moves most, as a tangent.
+
+    The derivative of the distorted coordinates, by complex steps; that of a focal length is x_d / fx, that of the
+    principal point 1 / fx.
+
+    Parameters
+    ----------
+    lens : Lens
+    rows, cols : int
+        Of the image.
+
+    Examples
+    --------
+    >>> lens_rates(Lens(fx=10, fy=20, cx=7.5, cy=7.5), 16, 16)
+    {'fx': 0.08, 'fy': 0.02, 'cx': 0.1, 'cy': 0.05}
+    """
+    before = lens.before(rows, cols)
+    u, v = np.meshgrid(np.linspace(0, cols, _POINTS), np.linspace(0, rows, _POINTS))
+    y, z = before.rays(u, v)
+    x_d, y_d = distort(before.model, before.k, -y, -z)[:2]
+    rates = {
+        "fx": float(np.abs(x_d).max()) / lens.fx,
+        "fy": float(np.abs(y_d).max()) / lens.fy,
+        "cx": 1 / lens.fx,
+        "cy": 1 / lens.fy,
+    }
+    for k, name in enumerate(list(lens.terms)[len(rates) :]):
+        coefficients = before.k.astype(complex)
+        coefficients[k] += 1j * _STEP
+        a, b = distort(before.model, coefficients, -y, -z)[:2]
+        rates[name] = float(np.hypot(a.imag, b.imag).max()) / _STEP
+    return rates
 
 
 def _pixels(value: Any) -> int | None:

@@ -173,7 +173,6 @@ def _added_up(sensor: Sensor, n: int) -> dict[str, Any]:
         "signal_e": sensor.signal_e * area,
         "ambient_e": sensor.ambient_e * area,
         "dark_e": sensor.dark_e * area,
-        "hot_e": sensor.hot_e,
         "dsnu_e": sensor.dsnu_e * n,
         "prnu": sensor.prnu / n,
         "read_noise_e": n * math.sqrt(sensor.read_variance_e2 / 2),
