@@ -19,7 +19,6 @@ from phasemark.matcher.estimate.fits import (
     SAME_RAD,
     Fits,
     best_of_frame,
-    distinct,
     distinct_of_frames,
     least_of_frame,
 )
@@ -342,16 +341,11 @@ def _apart(scene: Scene) -> tuple[float, ...]:
     return *_APART, _APART_COLUMNS * scene.search.column_rad
 
 
-def _near(fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Return the cost near which fits of each frame are followed: the least, or that of a rival of what is known."""
-    return least_of_frame(fits, len(explains)) if most is None else most
-
-
 def _are_stuck(
     setup: Setup, fits: Fits, explains: NDArray[np.float64], most: NDArray[np.float64] | None
 ) -> NDArray[np.bool_]:
     """Return which fits ended not far above what explains their frame: their cells may still hold an explanation."""
-    near = _near(fits, explains, most)
+    near = least_of_frame(fits, len(explains)) if most is None else most
     stuck = (fits.cost > explains[fits.frame]) & (fits.cost < near[fits.frame] + setup.policy.margin_cost)
     return np.asarray(stuck & (near >= explains)[fits.frame])
 
@@ -424,7 +418,9 @@ def _finished(
         return final
     others = fits[np.setdiff1d(np.arange(len(fits)), likely)]
     if scene.scout is not None and most is None:
-        others = _shifted(others, final, fits, n)
+        # a scout has costs of its own: with the change of the best fit of their frame
+        change = least_of_frame(final, n)[others.frame] - least_of_frame(fits, n)[others.frame]
+        others = replace(others, cost=others.cost + change)
     return Fits.joined([final, others.with_free(len(setup.free))])
 
 
@@ -443,12 +439,6 @@ def _recovered(scene: Scene, evidence: Evidence, starts: Starts, lost: Fits) -> 
         views = _spread(scene, own.view)
     best = _best_of(scene, evidence, own, views, _BEST_BESIDE, model=scene.final)
     return refine(scene.final, evidence, best, _close_settings(scene, evidence))
-
-
-def _shifted(others: Fits, final: Fits, scouted: Fits, n: int) -> Fits:
-    """Return fits of a scout with the change of the best fit of their frame, of n, added to their costs."""
-    change = least_of_frame(final, n)[others.frame] - least_of_frame(scouted, n)[others.frame]
-    return replace(others, cost=others.cost + change)
 
 
 def _around(scene: Scene, view: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -475,14 +465,13 @@ def fit_neighbouring_views(scene: Scene, evidence: Evidence, which: NDArray[np.i
     fits : Fits
         Of these frames and others, on the final images.
     """
-    order = np.lexsort((fits.cost, fits.frame))
-    observed = [k for k in order if fits.frame[k] in which and np.isfinite(fits.covariance[k]).all()]
-    around = _surrounded(scene.setup, fits[_most_likely(scene.setup, fits, observed)])
+    observed = np.isin(fits.frame, which) & np.isfinite(fits.covariance).all(axis=(1, 2))
+    likely = distinct_of_frames(fits, np.flatnonzero(observed), scene.setup.rules.symmetry)
+    around = _surrounded(scene.setup, fits[likely[_are_first(fits.frame[likely])]])
     close = _close_settings(scene, evidence)
     cost = costs_at(scene.final, evidence, around, close)
     order = np.lexsort((cost, around.frame))
-    place = np.arange(len(order)) - np.searchsorted(around.frame[order], around.frame[order])
-    again = around[order[place < MOST_REFINED]]
+    again = around[order[_are_first(around.frame[order])]]
     rival = least_of_frame(fits, len(evidence.weight))[again.frame]
     return refine(scene.final, evidence, again, close, rival=rival)
 
@@ -502,16 +491,9 @@ def _close_settings(scene: Scene, evidence: Evidence) -> DescentSettings:
     )
 
 
-def _most_likely(setup: Setup, fits: Fits, ordered: list[int]) -> NDArray[np.int64]:
-    """Return the few fits of each frame that are refined again: of places of their own, best first."""
-    chosen: list[int] = []
-    for k in ordered:
-        same = [j for j in chosen if fits.frame[j] == fits.frame[k]]
-        if len(same) < MOST_REFINED:
-            own = distinct(fits, np.array([*same, k]), setup.rules.symmetry)
-            if len(own) > len(same):
-                chosen.append(int(k))
-    return np.array(chosen, np.int64)
+def _are_first(frame: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which places of rising frames are among the few first ones of their frame, which are refined again."""
+    return np.asarray(np.arange(len(frame)) - np.searchsorted(frame, frame) < MOST_REFINED)
 
 
 def _surrounded(setup: Setup, fits: Fits) -> Fits:

@@ -248,7 +248,7 @@ class Search:
         view = np.zeros((len(b), len(VIEW_FIELDS)))
         view[:, 0], view[:, 1], view[:, 2] = self.cells.distance_m[i], self.cells.delta_rad[j], self._bearing_rad[b]
         for k, shift in enumerate(b):
-            view[k, 3:5] = self._upward.split(self._elevation(shift), view[k, 0])
+            view[k, 3:5] = self._upward.split(self.shifts[shift][0] * self._row_rad, view[k, 0])
         if self._tilt_rad is not None:
             view[:, 4:] += self._tilt_rad[f]
         return view
@@ -283,10 +283,6 @@ class Search:
         """Return what the prior adds to the cost of the most likely bearing within half a column."""
         off = max(abs(float(self._bearing_rad[index])) - self.column_rad / 2, 0.0)
         return (off / self._bearing_std_rad) ** 2
-
-    def _elevation(self, index: int) -> float:
-        """Return the elevation whose image is shifted by whole rows."""
-        return self.shifts[index][0] * self._row_rad
 
     def shifted(self, seen: Observation, shift: tuple[int, int]) -> Observation:
         """Move frames by a shift (rows up, columns right), so that the shifted point comes to the middle."""

@@ -351,12 +351,7 @@ def _flag(range_m, amplitude_e, noise_e2, lit, saturated, broken, least, wrap, f
 
 
 def _check_numbers(
-    n_frames: int,
-    first_view: int,
-    first_frame: int,
-    workers: int,
-    images: Sequence[PhasorImages],
-    sensor: Sensor,
+    n_frames: int, first_view: int, first_frame: int, workers: int, images: Sequence[PhasorImages], sensor: Sensor
 ) -> None:
     for name, value, least in (
         ("n_frames", n_frames, 1),

@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from phasemark import InputFileError, UsageError
 from phasemark.render.scene.body import Body
 
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
+"""Of red, green and blue."""
+
 
 def bodies_of_trimesh(scene: trimesh.Scene, albedo: float | None) -> list[Body]:
     """Return the meshes of a trimesh scene as bodies; see :meth:`phasemark.render.Scene.of_trimesh`.
@@ -68,9 +71,8 @@ def _without_scale(pose: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
 def _albedo_of(mesh: trimesh.Trimesh) -> float | NDArray[np.float64]:
     """Return the luminance of a mesh's material and of its texture on the mean, or of each face's colour."""
     visual: Any = mesh.visual
-    luminance = np.array([0.2126, 0.7152, 0.0722])
     if visual.kind in ("face", "vertex"):
-        return np.asarray(np.asarray(visual.face_colors, np.float64)[:, :3] @ luminance / 255)
+        return np.asarray(np.asarray(visual.face_colors, np.float64)[:, :3] @ LUMINANCE / 255)
     material = getattr(visual, "material", None)
     texture = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     colour: Any = getattr(material, "baseColorFactor" if hasattr(material, "baseColorFactor") else "main_color", None)
@@ -81,4 +83,4 @@ def _albedo_of(mesh: trimesh.Trimesh) -> float | NDArray[np.float64]:
         return 0.8
     own = 1.0 if colour is None else np.asarray(colour, np.float64)[:3] / 255
     drawn = 1.0 if texture is None else np.asarray(texture.convert("RGB"), np.float64).mean(axis=(0, 1)) / 255
-    return float(np.broadcast_to(own * drawn, 3) @ luminance)
+    return float(np.broadcast_to(own * drawn, 3) @ LUMINANCE)

@@ -15,6 +15,7 @@ from phasemark import InputFileError, UsageError
 from phasemark.render.rigid import product
 from phasemark.render.scene import NEEDS_MUJOCO
 from phasemark.render.scene.body import Body
+from phasemark.render.scene.mesh_files import LUMINANCE
 
 try:
     import mujoco
@@ -22,7 +23,6 @@ except ImportError:
     raise UsageError(NEEDS_MUJOCO) from None
 
 _GEOM = mujoco.mjtGeom
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 _REACH_M = 1000.0
 """Half a side of the square that stands for an infinite plane."""
 _STEP_M = 500.0
@@ -168,7 +168,7 @@ def _rgba(model: Any) -> NDArray[np.float64]:
 
 def _albedos(model: Any, albedo: str | float | Mapping[str, float]) -> list[float]:
     """Return the albedo of each geom."""
-    own = np.clip(_rgba(model)[:, :3] @ _LUMINANCE, 0.0, 1.0)
+    own = np.clip(_rgba(model)[:, :3] @ LUMINANCE, 0.0, 1.0)
     if isinstance(albedo, Mapping):
         names = [model.geom(g).name for g in range(model.ngeom)]
         for name, value in albedo.items():

@@ -14,10 +14,9 @@ from scipy.spatial.transform import Rotation
 from phasemark import InputFileError, UsageError
 from phasemark.render.rigid import composed
 from phasemark.render.scene.body import Body
-from phasemark.render.scene.mesh_files import bodies_of_trimesh, loaded_meshes
+from phasemark.render.scene.mesh_files import LUMINANCE, bodies_of_trimesh, loaded_meshes
 
 _ALBEDO = 0.8
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 
 
 def links_of_urdf(path: Path, albedo: float | None) -> list[Body]:
@@ -57,7 +56,7 @@ def links_of_urdf(path: Path, albedo: float | None) -> list[Body]:
                 colour = material.find("color") if len(material) else colours.get(material.get("name", ""))
                 if colour is not None:
                     rgba = _numbers(colour, "rgba", 4, where)
-                    own = float(np.clip(rgba[:3] @ _LUMINANCE, 0, 1))
+                    own = float(np.clip(rgba[:3] @ LUMINANCE, 0, 1))
                     if rgba[3] == 0:  # it is not to be seen
                         continue
             try:
