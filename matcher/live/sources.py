@@ -293,14 +293,14 @@ class Tmf8829Source(Source):
             end = at + self._HOST + 4 + payload
             if kind & 0xF0 == self._RESULTS:
                 first = at + self._HOST + self._HEADER_BYTES
-                size = (layout & 7) * (5 if layout & 8 else 3) + (2 if layout & 16 else 0) + (2 if layout & 32 else 0)
+                skip = (2 if layout & 16 else 0) + (2 if layout & 32 else 0)
+                size = skip + (layout & 7) * (5 if layout & 8 else 3)
                 if end > len(message) or first + n * size + self._FOOTER != end or not layout & 7:
                     raise InputFileError(f"{self.name}: a frame of {end - first} bytes is none of {n} zones")
                 status, _, mark = struct.unpack_from("<BBH", message, end - 4)
                 if mark != self._END or not status & self._IS_VALID:
                     raise InputFileError(f"{self.name}: a frame that its sensor takes for invalid")
                 zones = np.frombuffer(message, np.uint8, n * size, first).reshape(n, size)
-                skip = (2 if layout & 16 else 0) + (2 if layout & 32 else 0)
                 quarters = zones[:, skip].astype(np.float64) + 256.0 * zones[:, skip + 1]
                 return Recording({"range": quarters[None] / 4}, {"unit": "mm", "quantity": "range"}, flat=True)
             at = end

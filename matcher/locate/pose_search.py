@@ -56,9 +56,8 @@ def _grid_over(outline: Outline, bounds_m: tuple[float, float, float, float]) ->
     low_x, low_y, high_x, high_y = bounds_m
     wide, deep = high_x - low_x, high_y - low_y  # of a long map one row of nodes may be all
     spacing = max(_SPACING_M, math.sqrt(wide * deep / _MOST_NODES), max(wide, deep) / _MOST_NODES)
-    shape = (int((high_x - low_x) / spacing) + 1, int((high_y - low_y) / spacing) + 1)
-    corner = (low_x + 0.5 * ((high_x - low_x) - (shape[0] - 1) * spacing),
-              low_y + 0.5 * ((high_y - low_y) - (shape[1] - 1) * spacing))  # fmt: skip
+    shape = (int(wide / spacing) + 1, int(deep / spacing) + 1)
+    corner = (low_x + 0.5 * (wide - (shape[0] - 1) * spacing), low_y + 0.5 * (deep - (shape[1] - 1) * spacing))
     range_m = np.empty((shape[0] * shape[1], _DIRECTIONS), np.float32)
     _ranges(outline.pieces, corner, spacing, shape[1], range_m)
     return PoseGrid(corner, spacing, shape, bounds_m, range_m)
