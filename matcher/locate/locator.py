@@ -401,8 +401,10 @@ class Locator:
         near = [k for k in range(len(fits)) if excess[k] < DISAGREEMENT and fits[k].share >= self.least_explained]
         weight = np.exp(-0.5 * excess)
         weight /= weight.sum()
-        rated = [(fits[k], float(excess[k]), float(weight[k])) for k in near]
-        candidates = tuple(PoseCandidate(*fit.pose.tolist(), more, share, fit.share) for fit, more, share in rated)
+        candidates = []
+        for k in near:
+            x, y, yaw = fits[k].pose.tolist()
+            candidates.append(PoseCandidate(x, y, yaw, float(excess[k]), float(weight[k]), fits[k].share))
         covariance = best.covariance[:3, :3] + self.wall_map.part
         x, y, yaw = best.pose.tolist()
         least = self.least_explained
@@ -424,7 +426,7 @@ class Locator:
             observed=best.observed,
             accepted=not reason,
             reason=reason,
-            alternatives=candidates,
+            alternatives=tuple(candidates),
             evidence=_without(best, prior),
             tilt=self._tilt(best),
         )

@@ -198,7 +198,7 @@ def _plan(
 def _axes(shape: tuple[int, int], camera: tuple[float, ...]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return centres and borders of the columns, and of the rows, as tangents."""
     axes = zip(shape[::-1], camera[:2], camera[2:], strict=True)
-    return [((np.arange(n) - c) / f, (np.arange(n + 1) - 0.5 - c) / f) for n, f, c in axes]
+    return [((np.arange(n, dtype=float) - c) / f, (np.arange(n + 1, dtype=float) - 0.5 - c) / f) for n, f, c in axes]
 
 
 def _widened(borders: NDArray[np.float64]) -> NDArray[np.float64]:
