@@ -146,7 +146,7 @@ class Standing:
                 shared[np.ix_(into, into)] += match.systematic[name][np.ix_(own, own)]
         values, vectors = np.linalg.eigh(shared)
         # the symmetric root changes with the view as little as the covariance does
-        return self._jacobian(pose) @ ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T)
+        return np.asarray(self._jacobian(pose) @ ((vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T))
 
 
 def is_open(match: Match) -> bool:
