@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import math
 import sys
 from pathlib import Path
 
@@ -25,6 +26,8 @@ def pose_of(row: dict[str, str]) -> list[str] | None:
     try:
         t_ms, x, y, z, yaw = (float(row[name]) for name in NEEDED)
     except ValueError:
+        return None
+    if not all(map(math.isfinite, (t_ms, x, y, z, yaw))):
         return None
     return [f"{value:.9g}" for value in (t_ms, -x, -y, yaw, z - MARKER_ABOVE_MIDDLE_M)]
 
@@ -47,6 +50,8 @@ def main(argv: list[str] | None = None) -> int:
             rows, names = list(reader), list(reader.fieldnames or ())
         if missing := [name for name in NEEDED if name not in names]:
             raise ValueError(f"{arguments.csv}: no column {missing[0]!r}; needed are {', '.join(NEEDED)}")
+        if cut := [k for k, row in enumerate(rows) if None in row.values()]:
+            raise ValueError(f"{arguments.csv}: frame {cut[0]} has fewer values than there are columns")
         arguments.out.mkdir(parents=True, exist_ok=True)
         shown = [name for name in names if name == "t_ms" or name.startswith(("mm_", "status_"))]
         middle = len(rows) // 2

@@ -192,7 +192,7 @@ class Matcher:
         limits = {"false_alarm": false_alarm, "tolerance_m": tolerance_m, "tolerance_rad": tolerance_rad}
         self.bank = bank
         self.method = method
-        self.false_alarm = false_alarm
+        self.false_alarm, self.tolerance_m, self.tolerance_rad = false_alarm, tolerance_m, tolerance_rad
         self.options: Mapping[str, Any] = MappingProxyType(
             {"free": free, "background": background, "on": on, "pixels": pixels, "robust": robust}
         )

@@ -117,6 +117,10 @@ def test_the_command_prints_one_line(capsys):
     assert line.count("\n") == 1
     for part in ("cylinder at 1.5 m, δ 20°, 50 frames", " mm,", "1 σ", "class error", "noise of edge pixels dominates"):
         assert part in line
+    assert (
+        main(["accuracy", "--class", "cylinder", "--distance", "0.7", "--sensor", "vl53l5cx-8x8", "--wall", "1"]) == 0
+    )
+    assert "means over their zones" in capsys.readouterr().err
 
 
 def test_the_command_prints_json(capsys, tmp_path):

@@ -280,6 +280,7 @@ FACING = np.broadcast_to([0.0, 0.0, -1.0], (16, 16, 3))
         ({"intrinsics": [[20, 1, 7.5], [0, 20, 7.5], [0, 0, 1]]}, r"'intrinsics' must be \(fx, fy, cx, cy\) or"),
         ({"intrinsics": (20.0, np.nan, 7.5, 7.5)}, "'intrinsics' must be finite"),
         ({"intrinsics": intrinsics(16, np.tan(np.radians(20)))}, "2.5° are missing at its .*allow_uncovered=True"),
+        ({"sensor": "vl53l5cx-8x8"}, "'sensor' must be a Sensor, got str"),
         ({"quantity": "Z"}, "'quantity' must be z or range, got 'Z'"),
         ({"albedo": 1.2}, r"'albedo' must be in \[0, 1\], got 1.2"),
         ({"albedo": np.ones((8, 8))}, r"'albedo' must be a number or have shape \(16, 16\)"),

@@ -7,6 +7,7 @@ import io
 import json
 import os
 import runpy
+import shutil
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -283,6 +284,15 @@ def test_tables_without_a_column_are_refused_by_its_name(tmp_path):
     assert (code, err.count("\n")) == (3, 1)
     assert "no column 'panel_x_m'" in err
     assert not (tmp_path / "out").exists()
+    cut = "t_ms,panel_x_m,panel_y_m,panel_z_m,yaw_deg,mm_0\n0,1,0,0,nan,900\n66,1,0"
+    (tmp_path / "cut.csv").write_text(cut)
+    code, _, err = run("split_recording", tmp_path / "cut.csv", "--out", tmp_path / "out")
+    assert (code, err.count("\n")) == (3, 1)
+    assert "frame 1 has fewer values than there are columns" in err
+    (tmp_path / "whole.csv").write_text(cut + ",0,10,900")
+    assert run("split_recording", tmp_path / "whole.csv", "--out", tmp_path / "out")[0] == 0
+    assert len((tmp_path / "out" / "whole_poses.csv").read_text().splitlines()) == 2  # motion capture lost one
+    shutil.rmtree(tmp_path / "out")
     code, _, err = run("score_recording", tmp_path / "bare.csv", tmp_path / "bare.csv")
     assert (code, err.count("\n")) == (3, 1)
     assert "no column 'pose_time_s'" in err

@@ -359,6 +359,10 @@ def test_amplitudes_have_columns_of_their_own(tmp_path):
         (named("mm", ["1,1,2,3,4,5,6", ",1,2,3,4,5,6"], "t_s,"), "line 3: has no time: 't_s' must be a finite number"),
         (named("mm", ["1,1,2,3,4,5,6", "inf,1,2,3,4,5,6"], "t_s,"), "line 3: has no time"),
         (named("mm", ["1,2,3,4,5"]), "line 2 has 5 values, must have 6 \\(the columns that the header names\\)"),
+        (
+            named("mm", ["1.76e12,1,2,3,4,5,6"], "t_s,"),
+            "line 2: 't_s' must be seconds, got 1.76e.12, which are 5.6e.04 y",
+        ),
         (named("mm", ["1,2,3,?,5,6"]), r"line 2, column 4 \(mm_3\) must be a number, got '\?'"),
         (named("mm", []), "holds no frames"),
         ("# unit=m\n" + named("mm"), "line 2: has columns mm_0 …, but the first line says unit=m"),
@@ -447,9 +451,9 @@ def test_a_long_recording_with_empty_cells_is_read_in_seconds(tmp_path):
     n = 20_000
     cells = ["700"] * 64
     cells[7] = ""
-    line = ",".join(cells + ["5"] * 64)
+    line = ",".join(cells[1:] + ["5"] * 64)
     header = ",".join(["t_ms"] + [f"mm_{k}" for k in range(64)] + [f"status_{k}" for k in range(64)])
-    path = csv_file(tmp_path, header + "\n" + "".join(f"{66 * k},{line}\n" for k in range(n)))
+    path = csv_file(tmp_path, header + "\n" + "".join(f"{66 * k},{700 + k % 2},{line}\n" for k in range(n)))
     start = time.process_time()
     frames = read_frames(path, sensor=sensor, quantity="z", valid_status=[5])
     assert time.process_time() - start < 15
@@ -527,7 +531,7 @@ def test_a_header_of_pixel_numbers_is_no_frame(tmp_path):
         assert frames.range_m[0, :, 0, 0].tolist() == pytest.approx([1.0, 1.064, 1.128])
 
 
-def test_frames_that_repeat_the_one_before_are_noted_where_others_do_not(tmp_path):
+def test_frames_that_repeat_the_one_before_are_noted(tmp_path):
     rng = np.random.default_rng(4)
     text = "\n".join(",".join(f"{value:.4f}" for value in rng.normal(1.0, 0.01, 6)) for _ in range(4))
     each_twice = "\n".join(line for line in text.splitlines() for _ in range(2))
@@ -536,6 +540,8 @@ def test_frames_that_repeat_the_one_before_are_noted_where_others_do_not(tmp_pat
         UserWarning, match="4 of 8 frames repeat the one before to the last digit, the first .* frame 1:"
     ):
         read_frames(csv_file(tmp_path, each_twice), sensor=SMALL, **STATED)
+    with pytest.warns(UserWarning, match="19 of 20 frames repeat .* is the sensor stuck"):
+        read_frames(csv_file(tmp_path, "\n".join([text.splitlines()[0]] * 20)), sensor=SMALL, **STATED)
 
 
 @pytest.mark.parametrize("form", ["npz", "h5"])

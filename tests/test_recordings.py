@@ -17,7 +17,7 @@ from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.chi_squared import noise_tails, p_values_of
 from phasemark.matcher.commands.match_table import bank_ends, summary
 from phasemark.matcher.recordings.estimates_table import match_in_batches
-from phasemark.render import Background, Frames, Renderer, capture, preset
+from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 from phasemark.render.direct import HistogramRenderer
 from phasemark.render.sensor.sensor_file import sensor_toml
 
@@ -115,6 +115,32 @@ def test_the_note_names_the_first_position_that_moved(run, folder, tmp_path):
     options = ["--unit", "m", "--quantity", "range", "--method", "nearest", "--no-diagnosis"]
     _, _, err = run("match", folder / "bank.h5", tmp_path / "a.npz", *options)
     assert "moved during 1 of 3 positions, the first being 2," in err
+
+
+def test_of_frames_that_show_several_places_the_covariance_holds_them_or_the_answer_is_refused(folder):
+    wall, delta_rad = Background(wall_m=1.5), math.radians(30)
+    renderer = Renderer(build_mesh(catalog()["cylinder"]), ZONES)
+
+    def answers_of(*distances_m):
+        images = renderer.render_views(Views.broadcast(np.array(distances_m), delta_rad), background=wall)
+        frames = capture(images, ZONES, rng=np.random.default_rng(2), n_frames=1).as_one_position()
+        found = [next(iter(match_in_batches(one, frames, kalman_filter))).matches[0] for one in (refined, nearest)]
+        return *found, math.sqrt(found[0].covariance[0, 0])
+
+    with open_bank(folder / "bank.h5") as bank:
+        refined, nearest = Matcher(bank, "refine", background=wall), Matcher(bank, background=wall)
+        still, _, std_m = answers_of(*[0.65] * 10)
+        assert still.accepted
+        assert std_m < 5e-4
+        found, _, std_m = answers_of(*[0.65] * 9, 0.68)
+        assert found.distance_m - 0.65 > 2e-3
+        assert found.distance_m - 0.65 < 2 * std_m
+        found, _, std_m = answers_of(*np.linspace(0.65, 0.66, 10))
+        assert found.accepted
+        assert 2.5e-3 < std_m < 5e-3  # that of an even distribution over a centimetre is 2.9 mm
+        for found in answers_of(*[0.62] * 5, *[0.66] * 5)[:2]:
+            assert not found.accepted
+            assert found.reason in ("undetermined", "poor fit")
 
 
 def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):

@@ -1,5 +1,7 @@
 """A region of a large sensor's pixels, binned: geometry, noise, banks that hold it, frames that are matched there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -107,7 +109,9 @@ def test_blocks_add_up_phasors():
     region = Region(4, 76, 8, 104, 3)
     amplitude = rng.uniform(100, 900, (1, LARGE.rows, LARGE.cols))
     phase = rng.uniform(0.5, 1.5, amplitude.shape)
-    found = read_region(frames_of(LARGE, amplitude, phase, 0.02), region)
+    frames = frames_of(LARGE, amplitude, phase, 0.02)
+    found = read_region(frames, region)
+    assert read_region(replace(frames, std_is_pooled=True), region).std_is_pooled
     for row, col in ((0, 0), (5, 11), (23, 31)):
         block = np.s_[0, 4 + 3 * row : 7 + 3 * row, 8 + 3 * col : 11 + 3 * col]
         phasor = (amplitude[block] * np.exp(1j * phase[block])).sum()

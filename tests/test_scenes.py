@@ -531,6 +531,7 @@ def test_a_file_with_materials_becomes_a_scene(tmp_path):
         (lambda: Scene([]), "needs at least one body"),
         (lambda: Scene([Body.sphere(1, name="a"), Body.sphere(2, name="a")]), "two bodies are named 'a'"),
         (lambda: Scene(["box"]), "made of Body objects, got str"),  # type: ignore[list-item]
+        (lambda: Scene(None), "made of Body objects, got NoneType"),
         (lambda: Body.sphere(-1), "positive numbers of metres"),
         (lambda: Body.box((1, 2)), "'size_m' must be 3 positive numbers"),
         (lambda: Body.sphere(1, albedo=1.2), r"'albedo' must be in \[0, 1\], got 1.2"),

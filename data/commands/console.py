@@ -105,10 +105,14 @@ def echo_facts(facts: Mapping[str, Any], *, as_json: bool = False) -> None:
 
 @contextmanager
 def warnings_as_notes() -> Iterator[None]:
-    """Write each thing the library warns of as one line, ``note: …``, to stderr."""
+    """Write each thing the library warns of as one line, ``note: …``, to stderr, and once."""
+    said = set[str]()
 
     def show(message: Warning | str, *where: object, **more: object) -> None:
-        tell(f"note: {in_flags(one_line(str(message)))}")
+        note = f"note: {in_flags(one_line(str(message)))}"
+        if note not in said:
+            said.add(note)
+            tell(note)
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)

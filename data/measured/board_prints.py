@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from phasemark import InputFileError
+from phasemark.data.measured.recording import LATEST_S
 
 _LONGEST_LINE = 1 << 16
 _ANSI = re.compile(r"\x1b\[[0-9;]*[A-Za-z]")
@@ -304,7 +305,7 @@ def of_object(number: int, text: str) -> Printed:
         frame.status = [math.nan if value is None else float(value) for value in status]
         time = next((name for name in _JSON_TIMES if name in row), None)
         frame.time_s = None if time is None else float(row[time]) * _JSON_TIMES[time]
-        if not math.isfinite(frame.time_s or 0.0):
+        if not abs(frame.time_s or 0.0) < LATEST_S:
             raise ValueError
     except (ValueError, TypeError, KeyError, RecursionError, OverflowError):
         frame.spoil(_garbled(number, text, "an object with lists of numbers, 'distances' and 'status'"))

@@ -16,7 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import InputFileError
-from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, TILTS, Recording, note_disorder, one_time
+from phasemark.data.measured.recording import (
+    SECONDS_PER_TIME_UNIT,
+    TILTS,
+    Recording,
+    in_seconds,
+    note_disorder,
+    one_time,
+)
 from phasemark.render.frames import MOST_TILT_DEG
 
 _SEPARATORS = (";", "\t", ",")
@@ -194,7 +201,7 @@ def _times_s(values: NDArray[np.float64], name: str, body: _Text) -> NDArray[np.
             f"{body.path}: line {body.lines[bad[0]][0]}: has no time: '{name}' must be a finite number"
         )
     note_disorder(values, body.path, lambda k: f"line {body.lines[k][0]}")
-    return values * SECONDS_PER_TIME_UNIT[name]
+    return in_seconds(values, name, body.path, lambda k: f"line {body.lines[k][0]}")
 
 
 def _tilt_deg(values: NDArray[np.float64], name: str, body: _Text) -> NDArray[np.float64]:

@@ -31,6 +31,7 @@ from phasemark.data.measured.recording import (
     Orientation,
     Recording,
     impossible_ranges,
+    in_seconds,
     note_disorder,
     npz_bytes,
     one_time,
@@ -589,17 +590,18 @@ def _word(value: Any) -> str:
 
 
 def _note_repeated(range_m: NDArray[np.float64], path: Path) -> None:
-    """Warn of frames that equal the one before in every pixel, where others do not: they are no measurements."""
+    """Warn of frames that equal the one before in every pixel: they are no measurements."""
     known = np.isfinite(range_m)
     same = ((range_m[:, 1:] == range_m[:, :-1]) | ~(known[:, 1:] | known[:, :-1])).all(axis=(2, 3))
     repeated = same & known[:, 1:].any(axis=(2, 3))
-    count, fewest = int(repeated.sum()), 3  # fewer do no harm
-    if count >= fewest and not same.all():
+    count, fewest = int(repeated.sum()), 9 if same.all() else 3  # fewer do no harm
+    if count >= fewest:
         position, frame = np.argwhere(repeated)[0]
         where = f"frame {frame + 1}" + (f" of position {position}" if len(range_m) > 1 else "")
         warnings.warn(
             f"{path}: {count} of {known.shape[0] * known.shape[1]} frames repeat the one before to the last digit, the"
-            f" first being {where}: were they read faster than the sensor measures? Each counts as a measurement",
+            f" first being {where}: is the sensor stuck, or was it read faster than it measures? Each counts as a"
+            " measurement",
             stacklevel=2,
         )
 
@@ -634,4 +636,4 @@ def _times_s(values: NDArray[Any], name: str, path: Path) -> NDArray[np.float64]
         raise InputFileError(f"{path}: frame {k} has no time: '{name}' must be finite, got {times.ravel()[k]}")
     for position in times.reshape(-1, times.shape[-1] if times.ndim else 1):
         note_disorder(position, path, "frame {}".format)
-    return times * SECONDS_PER_TIME_UNIT[name]
+    return in_seconds(times, name, path, "frame {}".format)

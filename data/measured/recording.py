@@ -21,6 +21,8 @@ from phasemark.render import Sensor
 MILLISECONDS, SECONDS = "t_ms", "t_s"
 SECONDS_PER_TIME_UNIT: dict[str, float] = {MILLISECONDS: 1e-3, SECONDS: 1.0}
 """Names of time stamps, in CSV columns and in arrays, with the length of their unit."""
+LATEST_S = 2.0**31
+"""No clock of a recording is farther from its zero: what ROS can say, seconds."""
 TILTS = ("pitch_deg", "roll_deg")
 """Names of the tilt of each frame, in CSV columns and in arrays."""
 _NEAREST_M = 0.01
@@ -71,6 +73,34 @@ def one_time(names: Collection[str], where: object) -> str | None:
     if len(times) > 1:
         raise InputFileError(f"{where}: has both '{MILLISECONDS}' and '{SECONDS}': leave one of them out")
     return times[0] if times else None
+
+
+def in_seconds(times: NDArray[np.float64], name: str, path: Path, place: Callable[[int], str]) -> NDArray[np.float64]:
+    """Return time stamps in seconds.
+
+    Parameters
+    ----------
+    times : array of float64
+        In the unit of their name.
+    name : str
+        One of :data:`SECONDS_PER_TIME_UNIT`.
+    path, place
+        As for :func:`note_disorder`.
+
+    Raises
+    ------
+    InputFileError
+        One is later than :data:`LATEST_S`.
+    """
+    seconds = times * SECONDS_PER_TIME_UNIT[name]
+    late = np.flatnonzero(np.abs(seconds) > LATEST_S)
+    if late.size:
+        unit = "seconds" if name == SECONDS else "milliseconds"
+        raise InputFileError(
+            f"{path}: {place(int(late[0]))}: '{name}' must be {unit}, got {times.flat[late[0]]:.6g}, which are"
+            f" {seconds.flat[late[0]] / 3.16e7:.2g} years: is it in a smaller unit?"
+        )
+    return seconds
 
 
 def note_disorder(times: NDArray[np.float64], path: Path, place: Callable[[int], str]) -> None:

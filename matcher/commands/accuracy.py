@@ -8,7 +8,7 @@ import math
 from typing import Annotated
 
 from phasemark.data.commands.command import Shown
-from phasemark.data.commands.console import echo, echo_json
+from phasemark.data.commands.console import echo, echo_json, tell
 from phasemark.data.commands.inputs import (
     ClassOrMesh,
     background_of,
@@ -55,6 +55,8 @@ def accuracy_line(
     name, mesh = landmark.read()
     camera = read_sensor(sensor)
     note_too_far(camera, {"--distance": distance, "--wall": wall})
+    if camera.histogram is not None:
+        tell("note: of ranges that are means over their zones; peaks of a histogram tell less of δ and bearing")
     renderer = Renderer(mesh, camera, albedo=mesh.metadata.get("albedo", 0.8))
     views = Views.broadcast(distance, math.radians(delta or 0.0))
     renderer.check_in_view(views)

@@ -125,7 +125,7 @@ def _positions(
     if moving:
         return with_tilts_when_taken(measured.each_a_position(), matcher.bank.sensor.delay_s), reading
     if note := motion_note([measured]):
-        tell(f"note: {file}: {note}; --moving matches every frame by itself")
+        tell(f"note: {file}: {note}: covariances hold how far; --moving matches every frame by itself")
     return measured, reading
 
 

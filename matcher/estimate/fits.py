@@ -140,6 +140,7 @@ def with_refined(fits: Fits, which: NDArray[np.int64], again: Fits, n: int) -> F
     change, refitted = np.zeros(n), np.unique(again.frame)
     change[refitted] = least_of_frame(again, n)[refitted] - least_of_frame(fits, n)[refitted]
     others = fits[np.setdiff1d(np.arange(len(fits)), which)]
+    change = np.where(np.isfinite(change), change, 0.0)
     return Fits.joined([again, replace(others, cost=others.cost + change[others.frame])])
 
 

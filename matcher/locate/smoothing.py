@@ -41,7 +41,8 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
     and that do tell each of x, y and yaw. What disagrees most with the rest by χ² is left out, a measurement or a step
     of the odometry: wheels slip. Of two parts of the way that it does not join, one of a stop or two is not believed
     beside a longer one. A stop that was ambiguous or explained poorly is located again with the poses around as its
-    prior. An answer is accepted if its stop takes part and its pose is determined then.
+    prior. An answer is accepted if its stop takes part and its pose is determined then. A robot whose odometry often
+    does not hold keeps its answers.
 
     Parameters
     ----------
@@ -79,8 +80,10 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         alone = np.array([answers[k].accepted for k in own.tolist()])
         used |= np.array([found[k].accepted for k in own]) & ~alone
         poses, covariance, used, chain = _Chain([found[k] for k in own], steps, drift).solved(used)
-        if chain[-1] > _OFTEN * len(steps):  # only stops that were accepted alone speak for those near them
-            used &= np.isin(chain, chain[used & alone])
+        if chain[-1] > max(1.0, _OFTEN * len(steps)):
+            for k in own.tolist():
+                found[k] = answers[k]
+            continue
         # of two parts that contradict each other, a few stops are not believed beside many
         count = np.bincount(chain, used)
         used &= ((count > _FEW) | (count == count.max()))[chain]
@@ -149,7 +152,10 @@ class _Chain:
                 return poses, covariance[np.arange(n), :, np.arange(n)], used, np.cumsum(np.r_[0, ~whole])
             # between two measurements neither is known to be wrong, and the step is
             if slipped and step_off.max() >= _AS_WELL * measured_off.max():
-                whole[np.argmax(step_off)] = False
+                worst = np.argmax(step_off)
+                whole[worst] = False
+                if not self.steps[worst].any():  # wheels that count nothing while the robot moves are dead
+                    whole &= self.steps.any(axis=1)
             else:
                 used[np.argmax(measured_off)] = False
 

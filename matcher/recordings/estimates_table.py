@@ -13,6 +13,7 @@ from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.match import Match, Matches, named_in_degrees, scale_of_degrees
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.recordings.direct_positions import DirectPositions
+from phasemark.matcher.recordings.motion_spread import with_motion_spread
 from phasemark.render import Frames
 
 POSITIONS_AT_ONCE = 256
@@ -45,6 +46,9 @@ def match_in_batches(
 ) -> Iterator[MatchedBatch]:
     """Filter and match the positions of a recording in batches; the answers do not depend on the size of a batch.
 
+    Of a position during which something moved, covariances hold how far
+    (:func:`~phasemark.matcher.recordings.motion_spread.with_motion_spread`).
+
     Parameters
     ----------
     matcher : Matcher
@@ -65,7 +69,8 @@ def match_in_batches(
             yield MatchedBatch(start, some, matcher.match(some.frames))
         else:
             filtered = matcher.read_out(filter_frames(some))
-            yield MatchedBatch(start, filtered, matcher.match(filtered))
+            matches = with_motion_spread(matcher, some, filter_frames, matcher.match(filtered))
+            yield MatchedBatch(start, filtered, matches)
 
 
 class EstimateTable:

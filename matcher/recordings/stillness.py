@@ -1,8 +1,9 @@
 """Test whether camera and scene stood still while the frames at a position were taken.
 
-Two findings speak against it. *Order*: at rest the frames of a pixel could have come in any order. While something
+Three findings speak against it. *Order*: at rest the frames of a pixel could have come in any order. While something
 moves, neighbours in time are alike, and successive differences are small compared with the total scatter (von Neumann's
 ratio). This needs no noise level. *Scatter*: most pixels scatter far more than the noise law of the sensor says.
+*Wholes*: one frame is nearer or farther than the others in its pixels together.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ LEAST_CORRELATION = 0.05
 """Smaller correlations, though significant in a long recording, do no harm to the mean: drift of a warming sensor."""
 EXCESS_VARIANCE = 4.0
 """Variance over that of the noise law beyond which a pixel speaks of motion: noise is known to a factor of 2 or so."""
+LEAST_SHIFT = 0.25
+"""Shift of a whole frame in standard deviations of its pixels below which it is noise that they share."""
 
 _VALUES_AT_ONCE = 1 << 20
 
@@ -70,7 +73,11 @@ def motion_test(frames: Frames) -> MotionTest:
     *Scatter.* The variance of a pixel over that of the law is χ²(ν)/ν. The number of pixels that exceed
     `EXCESS_VARIANCE` is binomial; half of the pixels have to.
 
-    The p-value is twice the smaller of the two, and 1 for the order where the mean of C is below `LEAST_CORRELATION`.
+    *Wholes.* Ranges less their mean over time, over the standard deviation of the pixel, add up over the pixels of a
+    frame to a normal variable; the largest of all frames counts.
+
+    The p-value is three times the smallest of them; 1 for the order where the mean of C is below `LEAST_CORRELATION`,
+    and for wholes where the pixels of the frame are off by less than `LEAST_SHIFT` in the mean.
 
     Parameters
     ----------
@@ -94,7 +101,8 @@ def motion_test(frames: Frames) -> MotionTest:
     ranges = _unwrapped(frames).reshape(len(frames), frames.n_frames, -1)
     p_order, correlation = _order(ranges)
     p_scatter, excess = _scatter(ranges, frames)
-    return MotionTest(np.minimum(1.0, 2 * np.minimum(p_order, p_scatter)), correlation, excess)
+    smallest = np.minimum.reduce([p_order, p_scatter, _wholes(ranges)])
+    return MotionTest(np.minimum(1.0, 3 * smallest), correlation, excess)
 
 
 def motion_note(places: Sequence[Frames]) -> str:
@@ -162,6 +170,27 @@ def _correlations(series: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDA
     kurtosis = (centred**4).sum(axis=0) / squares**2
     variance = 1 / n - kurtosis / (2 * n) - (1 + kurtosis) / (2 * n * (n - 1))
     return np.where(told, 1 - steps / (2 * squares), np.nan), variance
+
+
+def _wholes(ranges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the p-value of the frame that is off most in all its pixels together, (n,)."""
+    n, n_frames, n_pixels = ranges.shape
+    p_value, fewest = np.ones(n), 3
+    if n_frames < fewest:
+        return p_value
+    at_once = max(1, _VALUES_AT_ONCE // (n_frames * n_pixels))
+    for start in range(0, n, at_once):
+        some = ranges[start : start + at_once]
+        valid = np.isfinite(some)
+        count = np.maximum(valid.sum(axis=1, keepdims=True), 1)
+        off = some - some.sum(axis=1, keepdims=True, where=valid) / count
+        variance = np.square(off).sum(axis=1, keepdims=True, where=valid) / count
+        told = valid & (variance > 0)
+        off = np.divide(off, np.sqrt(variance), out=np.zeros(off.shape), where=told).sum(axis=2)
+        size = np.sqrt(np.maximum(told.sum(axis=2), 1))
+        z = np.where(np.abs(off) >= LEAST_SHIFT * size**2, np.abs(off) / size, 0.0).max(axis=1)
+        p_value[start : start + at_once] = np.minimum(1.0, 2 * n_frames * special.ndtr(-z))
+    return p_value
 
 
 def _scatter(ranges: NDArray[np.float64], frames: Frames) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -25,7 +25,7 @@ from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.scene.depth_pieces import Pieces, cut_pixels
 from phasemark.render.scene.depth_slopes import fill_amplitudes
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
-from phasemark.render.sensor.sensor import Sensor
+from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
 
 _ALBEDO = 0.8
 _NEAREST_M, _FARTHEST_M = 1e-4, 1e6  # no surface is nearer or farther
@@ -112,6 +112,7 @@ def zones_from_depth(
     >>> zones.images.range_m[0, 4, 4].round(3), zones.histograms.expected.shape
     (np.float64(1.505), (1, 8, 8, 128))
     """
+    refuse_no_sensor(sensor)
     if quantity not in ("z", "range"):
         raise UsageError(f"'quantity' must be z or range, got {quantity!r}")
     depth = _depth_images(depth_m)

@@ -38,7 +38,7 @@ class Scene:
     """
 
     def __init__(self, bodies: Iterable[Body]) -> None:
-        given = list(bodies)
+        given = list(bodies) if isinstance(bodies, Iterable) else [bodies]
         wrong = [type(body).__name__ for body in given if not isinstance(body, Body)]
         if wrong:
             raise UsageError(f"a scene is made of Body objects, got {wrong[0]}")
