@@ -24,7 +24,7 @@ from phasemark.matcher import calibrate, kalman_filter
 from phasemark.matcher.calibration import KnownPoses
 from phasemark.matcher.calibration.mounting import PARAMETERS
 from phasemark.matcher.calibration.report import residual_figure
-from phasemark.matcher.calibration.result import shown, shown_std
+from phasemark.matcher.calibration.result import shown
 from phasemark.render import preset
 
 SENSOR = "vl53l5cx-8x8"
@@ -80,7 +80,8 @@ def main(argv: list[str] | None = None) -> int:
     sensor.write_text(found.to_toml(base_name=SENSOR), encoding="utf-8")
     residual_figure(found).savefig(figure, dpi=90)
     for name in found.free:
-        print(f"{name:13s} {shown(found, name):>9s} ± {shown_std(found, name)} {PARAMETERS[name].unit}")
+        value, std = shown(found, name)
+        print(f"{name:13s} {value:>9s} ± {std} {PARAMETERS[name].unit}")
     before, after = found.held_out_m
     print(f"residuals of held-out frames, r.m.s.: {1e3 * before:.1f} mm before, {1e3 * after:.1f} mm after")
     print(*found.notes, sensor, figure, sep="\n")
