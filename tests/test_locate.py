@@ -321,6 +321,17 @@ def test_odometry_that_stands_still_or_has_half_the_way_leaves_the_answers_as_th
     for odometry in (np.tile(first, (10, 1)), first + 0.5 * (recording.odometry - first)):
         joined = smoothed(replace(recording, odometry=odometry), vague, locator)
         assert joined == vague
+    # one step of rest that a wrong stop contradicts, and two wrong stops at the ends, are no odometry that fails
+    off = np.array([0.8, 0.0, 0.0])
+    rest = np.concatenate([np.tile(first, (3, 1)), recording.odometry[3:]])
+    for wrong, odometry in (((0,), rest), ((0, 9), recording.odometry)):
+        some = [replace(one, evidence=(one.evidence[0] + off * (k in wrong), one.evidence[1]))
+                for k, one in enumerate(answers)]  # fmt: skip
+        if odometry is rest:
+            some[:3] = [replace(answers[0], evidence=(answers[0].evidence[0] + off * (k == 0), answers[0].evidence[1]))
+                        for k in range(3)]  # fmt: skip
+        joined = smoothed(replace(recording, odometry=odometry), some, locator)
+        assert [k for k, one in enumerate(joined) if not one.accepted] == [*wrong]
 
 
 def test_stops_that_several_poses_explain_do_not_make_smoothed_poses_wrong():

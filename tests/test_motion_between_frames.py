@@ -70,6 +70,12 @@ def test_one_frame_of_another_place_is_found_though_its_pixels_scatter_little():
     assert (motion_test(Frames(ranges, sensor=ZONES)).p_value < 0.001).all()
 
 
+def test_pixels_that_show_one_value_have_not_moved():
+    ranges = noise(np.random.default_rng(25), 12, "normal")[:500]
+    ranges[:, :, :4] = 0.83
+    assert (motion_test(Frames(ranges, sensor=ZONES)).p_value < 0.001).sum() <= 5  # 0.5 expected
+
+
 def test_positions_in_no_order_are_found_by_their_scatter():
     rng = np.random.default_rng(22)
     ranges = noise(rng, 3, "normal")[:200] + rng.normal(0, 0.1, (200, 3, 1, 1))

@@ -19,7 +19,7 @@ from phasemark import InputFileError, PhasemarkError, UsageError
 from phasemark.data.measured.board_prints import JSON
 from phasemark.data.measured.boards import HEAD_BYTES
 from phasemark.data.measured.csv_frames import stated_in
-from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, impossible_ranges, npz_arrays
+from phasemark.data.measured.recording import SECONDS_PER_TIME_UNIT, impossible_ranges, in_seconds, npz_arrays
 from phasemark.inputs.reading import first_bytes, read_whole
 from phasemark.render import Sensor
 from phasemark.render.direct.footprints import histogram_of
@@ -126,7 +126,9 @@ def read_histograms(path: str | os.PathLike[str], *, sensor: Sensor) -> Histogra
     reference = arrays.get("reference_histogram")
     if reference is not None and (reference.ndim != 2 or len(reference) != n):
         raise InputFileError(f"{path}: 'reference_histogram' must have shape ({n}, bins), got {reference.shape}")
-    times = [arrays[name] * scale for name, scale in SECONDS_PER_TIME_UNIT.items() if name in arrays]
+    times = [
+        in_seconds(arrays[name], name, path, "frame {}".format) for name in SECONDS_PER_TIME_UNIT if name in arrays
+    ]
     try:
         frames = HistogramFrames(
             _image(counts, sensor).reshape(n, 1, sensor.rows, sensor.cols, -1),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,8 @@ _SILENT_FRAMES = 20
 """Frames after which a sensor that none has named is missed."""
 _MOST_OTHER_LINES = 256
 """Lines that are not a sensor's before the first one that is."""
+_OFTEN, _LINES = 3, 100
+"""How often among some lines a sensor is named that the rig lacks and that is no garbled name."""
 _BETWEEN_STOPS_S = 1.0
 """Time between stops whose recording has none."""
 
@@ -41,7 +44,7 @@ class RigLines(StreamSource):
     def __init__(self, stream: Stream, rig: Rig) -> None:
         super().__init__(stream)
         self._rig, self._heard, self._n_frames = rig, set[str](), 0
-        self._unknown = set[str]()
+        self._unknown, self._n_lines = Counter[str](), 0
         rows = [rows for rows, _ in rig.rows()]
         self._zones = dict(zip(rig.names, zip(rows, rig.numbers().columns.tolist(), strict=True), strict=True))
 
@@ -80,14 +83,15 @@ class RigLines(StreamSource):
         printed = of_object(0, text)
         if printed.damage:
             raise InputFileError(f"{self.name}: {printed.damage}")
+        self._n_lines += 1
+        if self._n_lines % _LINES == 0:
+            self._unknown.clear()
         given = json.loads(text)
         name, odometry = given.get("sensor"), given.get("odometry")
         if not isinstance(name, str) or name not in self._zones:
             wrong = f"{self.name}: frames name the sensor {name!r}, the rig has {', '.join(self._rig.names)}"
-            if repr(name) in self._unknown:
-                raise UsageError(wrong)
-            self._unknown.add(repr(name))  # once, a line is garbled
-            raise InputFileError(wrong)
+            self._unknown[repr(name)] += 1
+            raise UsageError(wrong) if self._unknown[repr(name)] == _OFTEN else InputFileError(wrong)  # garbled
         n, (rows, columns) = len(printed.distance_mm), self._zones[name]
         if n not in (columns, rows * columns):
             raise InputFileError(f"{self.name}: {n} zones, the sensor has {rows} × {columns}")
@@ -109,8 +113,6 @@ class RigLines(StreamSource):
         """Return lines of several sensors as one frame, invalid where a sensor sent nothing."""
         names, last = self._rig.names, list(held.values())[-1]
         self._heard |= held.keys()
-        if len(held) == len(names):
-            self._unknown.clear()
         self._n_frames += 1
         if self._n_frames >= _SILENT_FRAMES and (silent := [name for name in names if name not in self._heard]):
             raise UsageError(

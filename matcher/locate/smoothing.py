@@ -26,7 +26,7 @@ _SLIP = 1e-6
 _AS_WELL = 0.99
 """Share of the largest disagreement of a measurement with which a step is left out before it."""
 _OFTEN = 0.15
-"""Share of the steps that do not hold from which the odometry is not believed."""
+"""Share of steps that do not hold, between parts that are believed, from which the odometry is not."""
 _FEW = 2
 """Measurements beyond a step that does not hold that may be wrong together."""
 _LEAST_KNOWN = 1e-6
@@ -80,13 +80,14 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         alone = np.array([answers[k].accepted for k in own.tolist()])
         used |= np.array([found[k].accepted for k in own]) & ~alone
         poses, covariance, used, chain = _Chain([found[k] for k in own], steps, drift).solved(used)
-        if chain[-1] > max(1.0, _OFTEN * len(steps)):
+        # of two parts that contradict each other, a few stops are not believed beside many
+        count = np.bincount(chain, used)
+        believed = (count > _FEW) | (count == count.max())
+        if believed.sum() - 1 > max(1.0, _OFTEN * len(steps)):
             for k in own.tolist():
                 found[k] = answers[k]
             continue
-        # of two parts that contradict each other, a few stops are not believed beside many
-        count = np.bincount(chain, used)
-        used &= ((count > _FEW) | (count == count.max()))[chain]
+        used &= believed[chain]
         for k, pose, around, agrees in zip(own, poses, covariance + part, used, strict=True):
             found[k] = _joined(found[k], pose, around, bool(agrees), locator)
     return found
@@ -152,10 +153,10 @@ class _Chain:
                 return poses, covariance[np.arange(n), :, np.arange(n)], used, np.cumsum(np.r_[0, ~whole])
             # between two measurements neither is known to be wrong, and the step is
             if slipped and step_off.max() >= _AS_WELL * measured_off.max():
-                worst = np.argmax(step_off)
-                whole[worst] = False
-                if not self.steps[worst].any():  # wheels that count nothing while the robot moves are dead
-                    whole &= self.steps.any(axis=1)
+                whole[np.argmax(step_off)] = False
+                rests = ~self.steps.any(axis=1)
+                if (rests & ~whole).sum() > 1:  # wheels that count nothing while the robot moves are dead
+                    whole &= ~rests
             else:
                 used[np.argmax(measured_off)] = False
 

@@ -26,8 +26,8 @@ def with_motion_spread(
     """Return answers whose covariances hold how far the view moved while their frames were taken.
 
     Where a test finds motion, parts of the frames in a row are matched, too, and the covariance grows by the scatter
-    of their views about the answer. An answer is refused as "undetermined" if it no longer is within the tolerance,
-    and as a "poor fit" if fewer than two parts show its class.
+    of their views about the answer, less their own noise. An answer is refused as "undetermined" if it no longer is
+    within the tolerance, and as a "poor fit" if fewer than two parts show its class.
 
     Parameters
     ----------
@@ -52,18 +52,23 @@ def _with_spread(
     matcher: Matcher, frames: Frames, filter_frames: Callable[[Frames], FilteredFrames], match: Match
 ) -> Match:
     ends = np.linspace(0, frames.n_frames, min(_PARTS, frames.n_frames) + 1).astype(int).tolist()
-    off = []
+    off, noise = [], []
     for start, stop in pairwise(ends):
         one = matcher.match(filter_frames(frames.some_frames(start, stop)))[0]
         if one.class_name == match.class_name and one.reason in ("", "undetermined"):
             turn = math.remainder(one.delta_rad - match.delta_rad, math.tau / match.symmetry)
             one = replace(one, delta_rad=match.delta_rad + turn)
             off.append([getattr(one, name) - getattr(match, name) for name in matcher.free])
+            if one.covariance is not None:
+                noise.append(one.covariance - sum(one.systematic.values()))
     fewest = 2
     if len(off) < fewest:
         return replace(match, accepted=False, reason="poor fit")
-    known = match.covariance is not None
-    own = match.covariance if known else np.zeros((len(matcher.free),) * 2)
+    known, spread = match.covariance is not None, np.transpose(off) @ off / len(off)
+    if noise:
+        size = np.sqrt(np.mean(noise, axis=0).diagonal())
+        excess, axes = np.linalg.eigh((spread - np.mean(noise, axis=0)) / np.outer(size, size))
+        spread = np.outer(size, size) * ((axes * np.maximum(excess, 0.0)) @ axes.T)
     rules = Rules.of_bank(matcher.bank, matcher.free, matcher.false_alarm, matcher.tolerance_m, matcher.tolerance_rad)
-    found = with_parts(rules, replace(match, covariance=own + np.transpose(off) @ off / len(off)), {})
+    found = with_parts(rules, replace(match, covariance=match.covariance + spread if known else spread), {})
     return found if known else replace(found, covariance=None)

@@ -24,8 +24,9 @@ LEAST_CORRELATION = 0.05
 """Smaller correlations, though significant in a long recording, do no harm to the mean: drift of a warming sensor."""
 EXCESS_VARIANCE = 4.0
 """Variance over that of the noise law beyond which a pixel speaks of motion: noise is known to a factor of 2 or so."""
-LEAST_SHIFT = 0.25
-"""Shift of a whole frame in standard deviations of its pixels below which it is noise that they share."""
+LEAST_SHIFT, FEWEST_PIXELS = 0.5, 4
+"""Shift of a whole frame in standard deviations of its pixels below which it is noise that they share, and how many
+pixels make one."""
 
 _VALUES_AT_ONCE = 1 << 20
 
@@ -185,10 +186,10 @@ def _wholes(ranges: NDArray[np.float64]) -> NDArray[np.float64]:
         count = np.maximum(valid.sum(axis=1, keepdims=True), 1)
         off = some - some.sum(axis=1, keepdims=True, where=valid) / count
         variance = np.square(off).sum(axis=1, keepdims=True, where=valid) / count
-        told = valid & (variance > 0)
-        off = np.divide(off, np.sqrt(variance), out=np.zeros(off.shape), where=told).sum(axis=2)
-        size = np.sqrt(np.maximum(told.sum(axis=2), 1))
-        z = np.where(np.abs(off) >= LEAST_SHIFT * size**2, np.abs(off) / size, 0.0).max(axis=1)
+        told = valid & (variance > 1e-12)  # (1 µm)²: pixels that show one value are off by rounding
+        off = np.abs(np.divide(off, np.sqrt(variance), out=np.zeros(off.shape), where=told).sum(axis=2))
+        pixels = np.maximum(told.sum(axis=2), FEWEST_PIXELS)
+        z = np.where(off >= LEAST_SHIFT * pixels, off / np.sqrt(pixels), 0.0).max(axis=1)
         p_value[start : start + at_once] = np.minimum(1.0, 2 * n_frames * special.ndtr(-z))
     return p_value
 

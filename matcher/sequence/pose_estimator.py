@@ -218,7 +218,10 @@ class PoseEstimator:
             if moving is None:
                 moving = PoseFilter(one.pose, one.covariance, self._motion, self._gate)
                 moving.predict(self._last)
-            late, unknown = self._jitter_s * moving.rate, self._jitter_s**2 + self._delay_std_s**2
+            delay_variance = self._delay_std_s**2
+            if expected is not None and delay_variance:  # the last number of its state is the delay
+                delay_variance *= expected.covariance[-1, -1]
+            late, unknown = self._jitter_s * moving.rate, self._jitter_s**2 + delay_variance
             noise = one.covariance + np.outer(late, late) + unknown * moving.rate_covariance
             loading = np.column_stack([one.loading, self._delay_std_s * moving.rate])
             timed.append(replace(one, covariance=noise, loading=loading))

@@ -225,7 +225,8 @@ def light_bounces(topology: MeshTopology) -> bool:
 
 
 def _lift_of(topology: MeshTopology) -> float:
-    return _LIFT * min(_extent(topology), _WIDEST_M)
+    farthest = np.float32(max(-topology.low.min(), topology.high.max()))  # from the origin
+    return max(_LIFT * min(_extent(topology), _WIDEST_M), 4 * float(np.spacing(farthest)))
 
 
 def _extent(topology: MeshTopology) -> float:
