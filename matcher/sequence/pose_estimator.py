@@ -213,7 +213,8 @@ class PoseEstimator:
         alone, noise would make them seem to differ, and the filter would learn from that what they are.
         """
         timed = []
-        for one in self.standing.sightings(match, None if expected is None else expected.pose):
+        for given in self.standing.sightings(match, None if expected is None else expected.pose):
+            one = given
             moving = expected
             if moving is None:
                 moving = PoseFilter(one.pose, one.covariance, self._motion, self._gate)
@@ -223,12 +224,14 @@ class PoseEstimator:
                 delay_variance *= expected.covariance[-1, -1]
             late, unknown = self._jitter_s * moving.rate, self._jitter_s**2 + delay_variance
             noise = one.covariance + np.outer(late, late) + unknown * moving.rate_covariance
-            loading = np.column_stack([one.loading, self._delay_std_s * moving.rate])
-            timed.append(replace(one, covariance=noise, loading=loading))
+            delay = self._delay_std_s * moving.rate
+            one = replace(one, covariance=noise, loading=np.column_stack([one.loading, delay]))
             if expected is not None:
                 corrected = expected.copy()
-                corrected.take(timed[-1])
-                loading[:, :POSE] = self.standing.loading(match, corrected.pose)
+                corrected.take(one)
+                shared = self.standing.loading(match, corrected.pose)
+                one = replace(one, loading=np.column_stack([shared, delay]))
+            timed.append(one)
         return timed
 
     def _born(self, sighting: Sighting) -> PoseFilter:
