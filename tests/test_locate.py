@@ -312,13 +312,14 @@ def test_wheels_that_slip_between_two_stops_leave_the_others_joined():
         assert max(squares) < chi2.ppf(1 - 1e-4, 3)
 
 
-def test_odometry_that_stands_still_or_has_half_the_way_leaves_the_answers_as_they_are():
+def test_odometry_that_stands_still_or_stops_or_has_half_the_way_leaves_the_answers_as_they_are():
     one, rig, path, recording = drive(np.random.default_rng(7), stops=10)
     locator = Locator(one, rig)
     answers = locator.locate(recording, path, (0.1, 0.1, 0.1))
     vague = [replace(answers[k], accepted=False, reason="ambiguous") if k in (4, 5) else answers[k] for k in range(10)]
     first = recording.odometry[0]
-    for odometry in (np.tile(first, (10, 1)), first + 0.5 * (recording.odometry - first)):
+    stops = np.concatenate([recording.odometry[:4], np.tile(recording.odometry[3], (6, 1))])
+    for odometry in (np.tile(first, (10, 1)), stops, first + 0.5 * (recording.odometry - first)):
         joined = smoothed(replace(recording, odometry=odometry), vague, locator)
         assert joined == vague
     # one step of rest that a wrong stop contradicts, and two wrong stops at the ends, are no odometry that fails

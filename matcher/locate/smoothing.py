@@ -27,8 +27,9 @@ _AS_WELL = 0.99
 """Share of the largest disagreement of a measurement with which a step is left out before it."""
 _OFTEN = 0.15
 """Share of steps that do not hold, between parts that are believed, from which the odometry is not."""
-_FEW = 2
-"""Measurements beyond a step that does not hold that may be wrong together."""
+_FEW, _MANY = 2, 1 / 3
+"""Measurements beyond a step that does not hold that may be wrong together, and their share from which it is rather the
+odometry that is wrong."""
 _LEAST_KNOWN = 1e-6
 """Inverse squares of metres and radians: no stop is farther off than a kilometre, though a corridor does not say."""
 _MOST_STEPS = 10
@@ -83,7 +84,7 @@ def smoothed(recording: RigRecording, answers: Sequence[LocatedPose], locator: L
         # of two parts that contradict each other, a few stops are not believed beside many
         count = np.bincount(chain, used)
         believed = (count > _FEW) | (count == count.max())
-        if believed.sum() - 1 > max(1.0, _OFTEN * len(steps)):
+        if believed.sum() - 1 > max(1.0, _OFTEN * len(steps)) or count[~believed].sum() > _MANY * count.sum():
             for k in own.tolist():
                 found[k] = answers[k]
             continue
