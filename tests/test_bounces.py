@@ -299,6 +299,19 @@ def test_light_of_a_pose_does_not_depend_on_others_that_look_away_and_black_bodi
     assert not SceneRenderer(black, sensor, bounces=1, bounce_tolerance=1e-2).phasors(np.eye(4)).phasor.any()
 
 
+def test_a_floor_beyond_the_lamp_s_light_changes_nothing_of_one_bounce() -> None:
+    camera, found = PMD.with_(lamp_half_angle_deg=20), []
+    for width_m in (4, 2000):
+        bodies = [
+            Body.plane((width_m, width_m), pose=_pose((1, 0, -0.15)), albedo=0.5),
+            Body.plane((2, 2), pose=_pose((2, 0, 0.85), (-1, 0, 0)), albedo=0.5),
+            Body.box((0.16, 0.24, 0.25), pose=_pose((1, 0, -0.025)), albedo=0.8),
+        ]
+        found += [SceneRenderer(Scene(bodies), camera, bounces=k).phasors(np.eye(4)).phasor[0] for k in (0, 1)]
+    change = found[3] - found[2] - (found[1] - found[0])
+    assert np.sqrt(np.mean(np.abs(change) ** 2)) < 3e-4 * np.abs(found[0]).max()
+
+
 def test_bounces_that_cannot_be_computed_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     bodies, sensor = _corner()
     scene = Scene(bodies)

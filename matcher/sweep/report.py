@@ -348,7 +348,7 @@ def answer_cells(cells: Sequence[Cell]) -> list[Cell]:
         return []
     first = cells[0].condition
     others = [field.name for field in fields(first) if field.name not in _POOLED]
-    plain = [one for one in cells if all(getattr(one.condition, name) == getattr(first, name) for name in others)]
+    plain = [cell for cell in cells if all(getattr(cell.condition, name) == getattr(first, name) for name in others)]
     distances = sorted({one.condition.distance_m for one in plain})
     middle = distances[len(distances) // 2]
     by_method: dict[str, list[Cell]] = {}
