@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from phasemark.cli import main
-from phasemark.data import open_bank, read_frames
+from phasemark.data import BankPlan, build_bank, open_bank, read_frames
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import FilteredFrames, Matcher, kalman_filter
 from phasemark.matcher.chi_squared import noise_tails, p_values_of
@@ -141,6 +141,24 @@ def test_of_frames_that_show_several_places_the_covariance_holds_them_or_the_ans
         for found in answers_of(*[0.62] * 5, *[0.66] * 5)[:2]:
             assert not found.accepted
             assert found.reason in ("undetermined", "poor fit")
+
+
+def test_a_landmark_of_few_pixels_that_moved_is_as_uncertain_as_it_moved():
+    sensor, rng, n = preset("pmd-16x16"), np.random.default_rng(3), 20
+    renderer = Renderer(build_mesh(catalog()["cone"]), sensor)
+    plan = BankPlan(classes=("cone",), distance_m="0.8:1.2:0.02", delta_deg="0:360:30")
+    with build_bank(plan) as bank:
+        matcher = Matcher(bank, "refine")
+
+        def std_m(moved_m):
+            distance_m = rng.uniform(0.9, 1.1) + np.linspace(-moved_m / 2, moved_m / 2, n)
+            frames = capture(renderer.render(distance_m, 0.3), sensor, rng=rng, n_frames=1).as_one_position()
+            (match,) = next(iter(match_in_batches(matcher, frames, kalman_filter))).matches
+            return math.sqrt(match.covariance[0, 0])
+
+        assert max(std_m(0) for _ in range(5)) < 0.7e-3  # of the noise: 0.5 mm
+        # an even distribution over 15 mm has 4.3 mm; a tenth of the steps of the view is noise
+        assert all(3e-3 < std_m(0.015) < 7e-3 for _ in range(5))
 
 
 def test_rows_are_printed_as_batches_finish(folder, capsys, monkeypatch):

@@ -68,9 +68,10 @@ def match_in_batches(
         if isinstance(some, DirectPositions):
             yield MatchedBatch(start, some, matcher.match(some.frames))
         else:
-            filtered = matcher.read_out(filter_frames(some))
-            matches = with_motion_spread(matcher, some, filter_frames, matcher.match(filtered))
-            yield MatchedBatch(start, filtered, matches)
+            filtered = filter_frames(some)
+            read = matcher.read_out(filtered)
+            matches = with_motion_spread(matcher, some, filter_frames, filtered, matcher.match(read))
+            yield MatchedBatch(start, read, matches)
 
 
 class EstimateTable:

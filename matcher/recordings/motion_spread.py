@@ -3,31 +3,47 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import special
 
 from phasemark.matcher.estimate.acceptance import Rules, with_parts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
+from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.residuals import range_slopes
 from phasemark.matcher.match import Match, Matches
 from phasemark.matcher.matcher import Matcher
-from phasemark.matcher.recordings.stillness import motion_test
-from phasemark.render import Frames
+from phasemark.matcher.recordings.stillness import motion_test, unwrapped_alike
+from phasemark.render import Frames, Renderer, Views
 
 _PARTS, _FALSE_ALARM = 5, 1e-3
 """Parts that the frames of a position are matched in, and the probability of that where nothing moved."""
+_COSINES, _FEWEST_FRAMES = 4, 5
+"""Of time, in which slow motion is looked for: up to two swings; and frames below which they say next to nothing."""
 
 
 def with_motion_spread(
-    matcher: Matcher, frames: Frames, filter_frames: Callable[[Frames], FilteredFrames], matches: Matches
+    matcher: Matcher,
+    frames: Frames,
+    filter_frames: Callable[[Frames], FilteredFrames],
+    filtered: FilteredFrames,
+    matches: Matches,
 ) -> Matches:
     """Return answers whose covariances hold how far the view moved while their frames were taken.
 
-    Where a test finds motion, parts of the frames in a row are matched, too, and the covariance grows by the scatter
-    of their views about the answer, less their own noise. An answer is refused as "undetermined" if it no longer is
-    within the tolerance, and as a "poor fit" if fewer than two parts show its class.
+    Where a test of the pixels finds motion, or one of the views that the frames show, parts of the frames in a row are
+    matched, too, and the covariance grows by the scatter of their views about the answer, less their own noise. An
+    answer is refused as "undetermined" if it no longer is within the tolerance, and as a "poor fit" if fewer than two
+    parts show its class.
+
+    *Views.* What the ranges of a frame differ by from their mean is a step of the view by least squares, linear about
+    the answer, and whitened. At rest every cosine of time has the same share of these steps (the discrete cosine
+    transform is orthogonal); slow motion is in the first ones. Their share over that of the others is F, and the level
+    of the noise is not needed. A landmark of few pixels before much that stays moves few pixels, but all of its view.
 
     Parameters
     ----------
@@ -36,16 +52,70 @@ def with_motion_spread(
     frames : Frames
         n positions.
     filter_frames : callable
+    filtered : FilteredFrames
+        Its result.
     matches : Matches
         Of these positions.
     """
-    moved = motion_test(frames).p_value < _FALSE_ALARM
+    p_value = motion_test(frames).p_value
+    moved = np.minimum(p_value, _of_views(matcher, frames, filtered, matches)) < _FALSE_ALARM / 2
     return Matches(
         [
             _with_spread(matcher, frames[k : k + 1], filter_frames, match) if moved[k] and match.accepted else match
             for k, match in enumerate(matches)
         ]
     )
+
+
+def _of_views(matcher: Matcher, frames: Frames, filtered: FilteredFrames, matches: Matches) -> NDArray[np.float64]:
+    """Return the p-value of the slow motion of the views that single frames show, (n,); 1 where they cannot tell."""
+    p_value = np.ones(len(frames))
+    known = [k for k, match in enumerate(matches) if match.accepted and match.covariance is not None]
+    if frames.n_frames < _FEWEST_FRAMES:
+        return p_value
+    for name in sorted({matches[k].class_name or "" for k in known}):
+        mesh = matcher.bank.mesh(name)
+        renderer = Renderer(mesh, frames.sensor, albedo=float(mesh.metadata["albedo"]))
+        for k in (k for k in known if matches[k].class_name == name):
+            slope = _range_slopes(renderer, matches[k], matcher.free)
+            ranges = unwrapped_alike(frames[k : k + 1])[0].reshape(frames.n_frames, -1)
+            p_value[k] = _slow_p_value(_whitened_steps(ranges, filtered.std_m[k].ravel(), slope))
+    return p_value
+
+
+def _range_slopes(renderer: Renderer, match: Match, free: Sequence[str]) -> NDArray[np.float64]:
+    """Return how the ranges of all pixels change with the free parameters of an answer, (p, pixels)."""
+    view = Views(*(np.array([getattr(match, parameter)]) for parameter in VIEW))
+    behind = None if match.background is None else replace(match.background, bounces=0)
+    image, slope = renderer.render_with_slopes(view, free, background=behind)
+    phasor = image.phasor.reshape(1, -1)
+    first = slope.reshape(len(free), -1, phasor.size)[None, :, 0]  # of several modulation frequencies
+    return np.asarray(range_slopes(phasor, first, renderer.sensor.by_frequency[0])[0])
+
+
+def _whitened_steps(
+    ranges: NDArray[np.float64], std_m: NDArray[np.float64], slope: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return least-squares steps of the view from the mean of the frames to each, in units of equal noise, (n, p)."""
+    valid = np.isfinite(ranges)
+    mean = ranges.sum(axis=0, where=valid) / np.maximum(valid.sum(axis=0), 1)
+    weighted = slope * np.divide(1.0, std_m**2, out=np.zeros(std_m.shape), where=std_m > 0)
+    values, vectors = np.linalg.eigh(weighted @ slope.T)
+    told = values > 1e-9 * values[-1]
+    return np.asarray(np.where(valid, ranges - mean, 0.0) @ weighted.T @ (vectors[:, told] / np.sqrt(values[told])))
+
+
+def _slow_p_value(steps: NDArray[np.float64]) -> float:
+    """Return the p-value of what the first cosines of time have of steps (n, p), by F and Bonferroni."""
+    n, p = steps.shape
+    count = np.arange(1, min(_COSINES, (n - 1) // 2) + 1)
+    cosines = np.cos(np.pi / n * count[:, None] * (np.arange(n) + 0.5)) * math.sqrt(2 / n)
+    slow = np.square(cosines @ steps).sum(axis=1).cumsum()
+    rest = np.square(steps).sum() - slow
+    if not (p and (rest > 0).all()):
+        return 1.0
+    ratio = slow / count / (rest / (n - 1 - count))
+    return float(len(count) * special.fdtrc(count * p, (n - 1 - count) * p, ratio).min())
 
 
 def _with_spread(

@@ -99,7 +99,7 @@ def motion_test(frames: Frames) -> MotionTest:
     >>> [bool(motion_test(Frames(ranges, sensor=sensor)).moved()[0]) for ranges in (still, driving)]
     [False, True]
     """
-    ranges = _unwrapped(frames).reshape(len(frames), frames.n_frames, -1)
+    ranges = unwrapped_alike(frames).reshape(len(frames), frames.n_frames, -1)
     p_order, correlation = _order(ranges)
     p_scatter, excess = _scatter(ranges, frames)
     smallest = np.minimum.reduce([p_order, p_scatter, _wholes(ranges)])
@@ -123,7 +123,7 @@ def motion_note(places: Sequence[Frames]) -> str:
     return f"the camera or the scene moved during {where}, so that the mean of the frames is no single view"
 
 
-def _unwrapped(frames: Frames) -> NDArray[np.float64]:
+def unwrapped_alike(frames: Frames) -> NDArray[np.float64]:
     """Return ranges on the same side of the wrap as the first valid one of their pixel; NaN where invalid."""
     ranges = frames.range_m
     if not ranges.shape[1]:
