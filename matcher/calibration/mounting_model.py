@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 import trimesh
@@ -166,6 +167,8 @@ class CalibrationModel:
         self._axis_cosine = self.sensor.axis_cosine() if self.reports_z else None
         self._bounced: list[PhasorImages] = []
         self._renderer = self._rendering()
+        # of the images that a step needs, many have one mounting, and to check a sensor takes as long as to render one
+        self._camera = lru_cache(maxsize=32)(lambda mounting: mounting.on(self.sensor))
         self._scenes = [(np.arange(len(self.poses)), self.background)]
         if self.poses.wall_m is not None:
             base = self.background or Background()
@@ -429,7 +432,7 @@ class CalibrationModel:
 
         Not `direct`: with the light that bounces at this mounting.
         """
-        renderer = self._renderer.seen_by(mounting.on(self.sensor))
+        renderer = self._renderer.seen_by(self._camera(mounting))
         self.rendered()
 
         def seen(views: Views, background: Background | None) -> PhasorImages:

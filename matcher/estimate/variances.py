@@ -154,11 +154,12 @@ def _summed(a: _Float, b: _Float) -> _Float:
     """Return the sum over k of a_k b_kᵀ, in products too small for a BLAS to spread them over busy processors."""
     chunk = 10  # frames in one matrix product
     n = -(-len(a) // chunk)
-    padding = ((0, n * chunk - len(a)), (0, 0), (0, 0))
 
     def chunks(one: _Float) -> _Float:
-        whole = np.pad(one, padding).reshape(n, chunk, one.shape[1], one.shape[2])
-        return np.ascontiguousarray(whole.transpose(0, 2, 1, 3)).reshape(n, one.shape[1], -1)
+        whole = np.zeros((n * chunk, *one.shape[1:]))  # np.pad takes as long as the products
+        whole[: len(one)] = one
+        shaped = whole.reshape(n, chunk, one.shape[1], one.shape[2])
+        return np.ascontiguousarray(shaped.transpose(0, 2, 1, 3)).reshape(n, one.shape[1], -1)
 
     return np.asarray((chunks(a) @ chunks(b).transpose(0, 2, 1)).sum(axis=0))
 
