@@ -290,3 +290,23 @@ def test_a_covariance_holds_the_minimum_beside_it_that_was_left():
     expected = np.diag([1e-6, 4e-6]) + share * np.outer([-0.003, -0.02], [-0.003, -0.02])
     np.testing.assert_allclose(both.covariance[0], expected)
     np.testing.assert_allclose(both.std_without_one[0], np.sqrt(np.diag(expected)))
+
+
+def test_images_that_no_interpolation_follows_make_no_answer(tmp_path):
+    # an upright board with a shelf at the top and one at the bottom: in a pixel that sees along them a degree decides
+    # whether a shelf or the board far behind is seen, and interpolated ranges turn by 20 m/rad; rendered ones by 0.04
+    boards = [((0.012, 0.24, 0.26), (-0.1, 0, 0)), *(((0.2, 0.24, 0.012), (0, 0, z)) for z in (-0.12, 0.12))]
+    boxes = [trimesh.creation.box(size, trimesh.transformations.translation_matrix(at)) for size, at in boards]
+    n, errors, claimed = 60, [], []
+    with bank_of(tmp_path, {"shelf": trimesh.boolean.union(boxes)}, "0.6:1.1:0.01", "0:360:1") as bank:
+        matcher = Matcher(bank, "refine", free=FIXED)
+        for exposures in (50, 400):
+            views = Views.broadcast(np.full(n, 0.8486), math.radians(307.67))
+            for match in matcher.match(frames_of(bank, "shelf", views, exposures, 1)):
+                if match.accepted:
+                    errors.append([match.distance_m - 0.8486, match.delta_rad - math.radians(307.67)])
+                    claimed.append(match.covariance)
+    assert len(errors) > 0.95 * 2 * n
+    squares = np.einsum("kp,kpq,kq->k", errors, np.linalg.inv(claimed), errors)
+    low, high = chi2.ppf([0.001, 0.999], 2 * len(squares)) / len(squares)
+    assert low < squares.mean() < 1.15 * high  # of 2 in expectation; off by 286 times without the test

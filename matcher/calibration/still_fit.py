@@ -106,6 +106,10 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
         if model.light_bounces:
             model.let_bounce(place.theta)
             place = fit.solve(place.theta, place.use, place.shift)
+        for _ in range(0 if noise_measured else _ROUNDS):
+            evidence = _with_noise_of_the_law(evidence, frames, place.images)
+            fit = fit_with(pose_std)
+            place = fit.solve(place.theta, place.use, place.shift)
         if fit.p_value(place, less=minima_cost) >= FALSE_ALARM:
             place = fit.search(place)
         if pose_std is None and len(poses) >= _POSES_FOR_ERRORS and fit.p_value(place) < FALSE_ALARM:
@@ -125,7 +129,7 @@ def _solution(
 ) -> Solution:
     """Return the result of a fit; `estimated` are the pose errors found from the residuals, if they were."""
     poses, use = problem.poses, place.use
-    information, scatter = fit.knowledge(place)
+    information, scatter, lasting = fit.knowledge(place)
     try:
         check_observable(information, fit.free, fit.scale, poses)
     except UsageError as error:  # all numbers could be determined where the fit began
@@ -148,6 +152,7 @@ def _solution(
         else:
             covariance = covariance * excess
             source += f", scaled by χ² = {excess:.3g} for each degree of freedom, for the residuals are more than noise"
+        covariance = covariance + plain @ lasting @ plain
         notes += sentences.misfit_notes(excess, p_value, poses, pose_chi2 / np.maximum(count, 1))
     notes += sentences.unused_notes(fit.edges, poses, count)
     notes += sentences.observability_notes(fit.free, covariance, fit.scale, poses)
@@ -353,7 +358,7 @@ class StillFit:
                 break
         return self._with_its_pixels(place)
 
-    def knowledge(self, place: Place) -> tuple[_Float, _Float]:
+    def knowledge(self, place: Place) -> tuple[_Float, _Float, _Float]:
         """Return the information of a place, from slopes that no corner and no faint pixel distort, and its scatter.
 
         Returns
@@ -362,10 +367,18 @@ class StillFit:
             On the free parameters, uncertain poses taken into account.
         scatter : (p, p) float64
             Sum of outer products of the poses' own gradients: the middle of a sandwich.
+        lasting : (p, p) float64
+            What residuals of a pixel that are alike in all poses, as those of a fixed pattern, add to that.
         """
         linear = self._linearise_wide(place, _WIDTHS)
-        by_pose, _ = linear.gradients(self._pull(place), place.u)
-        return linear.information, by_pose.T @ by_pose
+        pull = self._pull(place)
+        by_pose, _ = linear.gradients(pull, place.u)
+        own = (linear.rows * pull[:, None]).reshape(len(pull), len(self.free), self.evidence.per_pixel, -1).sum(axis=2)
+        by_pixel = own.sum(axis=0) / self.scale[:, None]
+        own = own / self.scale[:, None]
+        value, vectors = np.linalg.eigh(by_pixel @ by_pixel.T - np.einsum("kpr,kqr->pq", own, own))
+        axes = self.scale[:, None] * vectors * np.sqrt(np.maximum(value, 0.0))
+        return linear.information, by_pose.T @ by_pose, axes @ axes.T
 
     def information(self, theta: _Float, use: _Bool) -> _Float:
         """Return the information of some pixels in a mounting, (p, p), at little cost."""
@@ -536,6 +549,13 @@ class StillFit:
             for k in np.argsort(costs, kind="stable")[:_SEARCH_FROM]
         ]
         return self._descend(min(descended, key=lambda one: one.cost))
+
+
+def _with_noise_of_the_law(evidence: Evidence, frames: FilteredFrames, images: Images) -> Evidence:
+    """Return ranges with the noise that the law tells of the light of model images, which edges and slopes lessen."""
+    std = np.maximum(predicted_range_std(np.abs(images.phasor), images.intensity, evidence.sensor), 1e-4)
+    count = frames.n_effective.reshape(std.shape)
+    return replace(evidence, weight=np.where(evidence.weight > 0, count / std**2, 0.0))
 
 
 def _steady(evidence: Evidence) -> _Bool:

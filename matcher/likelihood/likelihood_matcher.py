@@ -25,6 +25,7 @@ from phasemark.matcher.likelihood.background_estimate import (
 )
 from phasemark.matcher.likelihood.floor_albedo import estimate_floors, fit_before_floors
 from phasemark.matcher.likelihood.images import VIEW
+from phasemark.matcher.likelihood.interpolation import misled_frames
 from phasemark.matcher.likelihood.profiles import with_profiles
 from phasemark.matcher.likelihood.refine import refine
 from phasemark.matcher.likelihood.residuals import Evidence
@@ -114,8 +115,8 @@ class LikelihoodMatcher:
 
     @property
     def is_quick(self) -> bool:
-        """Whether a search renders nothing, for the images of the bank are fine enough."""
-        return self.scenes.is_exact and not self.setup.auto
+        """Whether a search renders next to nothing, for the images of the bank are fine enough."""
+        return self.scenes.interpolates
 
     def track(self, frames: FilteredFrames, near: Sequence[Match]) -> Match:
         """Match one filtered frame from expected views alone, before an expected background.
@@ -151,11 +152,17 @@ class LikelihoodMatcher:
         share = min(share, self.setup.policy.frames_at_once, max(most, 1))
         return [which[start : start + share] for start in range(0, len(which), share)]
 
-    def _match_stated(self, frames: FilteredFrames) -> list[Match]:
-        """Match frames, all of them tilted or none, before the background that was stated, or none."""
+    def _match_stated(self, frames: FilteredFrames, *, on_rendered: bool = False) -> list[Match]:
+        """Match frames, all of them tilted or none, before the background that was stated, or none.
+
+        Those that interpolated images mislead are matched again `on_rendered` ones.
+        """
         setup, stated = self.setup, self.setup.stated
         evidence = Evidence.from_frames(frames, setup.on)
-        scene = self.scenes.tilted(evidence.tilt_rad) if evidence.tilt_rad.any() else self.scenes.stated
+        interpolates = self.scenes.interpolates and not (on_rendered or evidence.tilt_rad.any())
+        scene = self.scenes.on_rendered() if on_rendered else self.scenes.stated
+        if evidence.tilt_rad.any():
+            scene = self.scenes.tilted(evidence.tilt_rad)
         bare = bare_cost(evidence.seen, scene.behind)
         fits = search_views(scene, evidence, evidence.seen, bare)
         fits = fit_without_borders(scene, evidence, fits)
@@ -172,7 +179,12 @@ class LikelihoodMatcher:
             parts = zip(answers, floors.part, strict=True)
             answers = [with_parts(setup.rules, answer, {"floor_albedo": part}) for answer, part in parts]
         answers = self._with_mirror(evidence, answers, scene.search)
-        return with_shared_errors(setup, self.scenes, self._systematic, evidence, answers)
+        answers = with_shared_errors(setup, self.scenes, self._systematic, evidence, answers)
+        misled = misled_frames(scene, self.scenes.rendered, evidence, fits) if interpolates else np.empty(0, np.int64)
+        if misled.size:
+            for k, answer in zip(misled, self._match_stated(frames[misled], on_rendered=True), strict=True):
+                answers[k] = answer
+        return answers
 
     def _match_auto(self, frames: FilteredFrames) -> list[Match]:
         """Match frames, each before what stands behind it."""

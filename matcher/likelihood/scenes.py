@@ -27,8 +27,8 @@ from phasemark.render import Background, PhasorImages, Renderer, Views
 __all__ = ["Scene", "Scenes"]
 
 _FINE_GRID, _COARSE_GRID = (0.011, math.radians(1.1)), (0.022, math.radians(2.2))
-"""Widest steps of a bank, metres and radians, on which interpolated images are at the bound, and on which they lead to
-the solution."""
+"""Widest steps of a bank, metres and radians, on which interpolated images may be the answer, and on which they lead to
+it."""
 _ALBEDO_RATIOS = 1 / 8, 8.0
 """Factors on a landmark's brightness beside the background's between which it is looked for where it is free."""
 _SHARES_OF_COLUMN = -0.5, -0.25, 0.25, 0.5
@@ -123,10 +123,11 @@ class Scenes:
         if setup.auto:
             open_cells = self.cells(None, open_edges=True) if like is None else like.open_search.cells
             self.open_search = self.search.before(open_cells)
-        exact, self._scout = self._bank_models(behind)
-        self.is_exact = exact is not None
-        self.stated = Scene(setup, behind, exact or self.rendered, None if exact else self._scout, self.search)
-        if setup.auto or exact is None:
+        interpolated, self._scout = self._bank_models(behind)
+        self.interpolates = interpolated is not None
+        final, scout = (interpolated, None) if interpolated else (self.rendered, self._scout)
+        self.stated = Scene(setup, behind, final, scout, self.search)
+        if setup.auto or interpolated is None:
             self._check_distances()
         if setup.stated is not None and setup.stated.floor_m is not None and "height_m" not in setup.free:
             self._check_floor(setup.stated.floor_m)
@@ -162,6 +163,10 @@ class Scenes:
         """
         search = self.search.before(*(self.cells(background_of(self._bank, own)) for own in backgrounds))
         return replace(self.before(backgrounds), search=search, closed_search=None)
+
+    def on_rendered(self) -> Scene:
+        """Return the scene that is stated, with answers from rendered images."""
+        return replace(self.stated, final=self.rendered, scout=self._scout)
 
     def open(self) -> Scene:
         """Return the scene without a background whose search leaves open whether there is one."""
@@ -223,21 +228,22 @@ class Scenes:
         return turned
 
     def _bank_models(self, behind: PhasorImages | None) -> tuple[BankModel | None, BankModel | StripModel | None]:
-        """Return the interpolated images that the answer is taken from, and those of a scout; None where unfit."""
+        """Return interpolated images that an answer may be taken from, and those of a scout; None where unfit."""
         setup = self._setup
         fixed = setup.free == VIEW[:2]
         alone = setup.on == "ranges" and self._setup.stated is None
         chip = setup.reports_one_surface  # its ranges jump between the nodes of a bank, and its strips need no tilt
-        is_exact = fixed and alone and not chip and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
+        plain = alone and not (chip or setup.auto or setup.unknown or setup.huber is not None)
+        interpolates = fixed and plain and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
         level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
-        has_strips = alone and not is_exact and level
+        has_strips = alone and not interpolates and level
         if has_strips and StripModel.suits(self._bank, self.search.widest_columns):
             return None, StripModel(self._bank, self.search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
-        if not (is_exact or scouts):
+        if not (interpolates or scouts):
             return None, None
         model = BankModel(self._bank)
-        return model if is_exact else None, model.smooth(behind) if scouts else None
+        return model if interpolates else None, model.smooth(behind) if scouts else None
 
     def check_tilted(self) -> None:
         """Check that tilted frames can be matched."""

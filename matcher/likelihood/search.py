@@ -78,7 +78,7 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
         limit = np.full(len(which), np.inf)
     starts = search.starts(seen[which], limit, cost_of)
     # 3, 4  descend from there, and refine on final images
-    fits = fit_starts(scene, evidence, which, starts, _most(setup, evidence[which]))
+    fits = fit_starts(scene, evidence, which, starts, explaining_cost(setup, evidence[which]))
     refused_p = 0.01  # p-value at which views around the best fits are tried too
     # 5  where nothing fits, look around the best fits
     poor = np.flatnonzero(are_doubtful(setup, fits, len(evidence.weight), refused_p))
@@ -98,7 +98,7 @@ def _in_all_cells(scene: Scene, evidence: Evidence, seen: Observation, fits: Fit
     """
     setup, n = scene.setup, len(evidence.weight)
     which = np.flatnonzero(are_doubtful(setup, fits, n, setup.rules.false_alarm))
-    limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), _most(setup, evidence[which])
+    limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), explaining_cost(setup, evidence[which])
     nothing = np.empty(0, np.int64), np.empty((0, len(VIEW)))
     starts = scene.search.of_frames(which).uncovered(seen[which], limit, [nothing] * len(which))
     for some in _in_parts(starts, len(which)):
@@ -127,7 +127,7 @@ def _with_rivals(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits
         if not best.size:
             return fits
         which = fits.frame[best]
-        limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), _most(setup, evidence[which])
+        limit, most = _limit(setup, seen[which], evidence.noise_tails[which]), explaining_cost(setup, evidence[which])
         closed_limit = _limit(setup, evidence.seen[which], evidence.noise_tails[which])
         if setup.huber is None:
             most = np.minimum(most, fits.cost[best] + setup.rules.rival_cost)
@@ -186,7 +186,7 @@ def _limit(setup: Setup, seen: Observation, tails: NDArray[np.float64]) -> NDArr
     return largest_costs(setup.rules.false_alarm, seen.returned.sum(axis=1), tails) + setup.rules.rival_cost
 
 
-def _most(setup: Setup, evidence: Evidence) -> NDArray[np.float64]:
+def explaining_cost(setup: Setup, evidence: Evidence) -> NDArray[np.float64]:
     """Return the cost up to which a view explains a frame."""
     residuals = evidence.per_pixel * np.count_nonzero(evidence.weight, axis=1)
     return largest_costs(setup.rules.false_alarm, residuals, evidence.noise_tails) + setup.rules.rival_cost

@@ -26,7 +26,7 @@ from phasemark.matcher.likelihood.uncertainty import step_of_others
 from phasemark.matcher.nearest.bank_minima import Starts
 from phasemark.matcher.nearest.cells import WIDE_PIXEL_RAD
 
-__all__ = ["with_valleys"]
+__all__ = ["rise_at", "with_valleys"]
 
 _ASKED_SIGMA, _DOUBTFUL_SHARE = 4.0, 0.5
 """How many standard deviations away the likelihood is asked whether a covariance holds, and below which share of the
@@ -138,7 +138,7 @@ def _along_valleys(
     ways = _ASKED_SIGMA * np.concatenate(asked, axis=1)
     expected = np.einsum("kwp,kpq,kwq->kw", ways[..., :p], information, ways[..., :p])
     n = ways.shape[1]
-    rise, there = _rise_at(problem, state, np.repeat(known, n), ways.reshape(-1, ways.shape[2]))
+    rise, there = rise_at(problem, state, np.repeat(known, n), ways.reshape(-1, ways.shape[2]))
     rise = rise.reshape(expected.shape)
     least = rise.argmin(axis=1)
     falls = rise.min(axis=1) < -BETTER_COST
@@ -170,7 +170,7 @@ def _at_least(
     return np.asarray(one + (axes * np.maximum(value, 0.0)) @ axes.T)
 
 
-def _rise_at(
+def rise_at(
     problem: Problem,
     state: State,
     which: NDArray[np.integer],
@@ -226,9 +226,9 @@ def _rise_beside(
     All else follows by one Gauss–Newton step there, or hardly, as across a kink.
     """
     alone = np.einsum("kp,kp->k", axes.held, move)[:, None] * axes.alone
-    rise = _rise_at(problem, state, np.tile(which, 2), np.concatenate([move, alone]))[0].reshape(2, -1)
+    rise = rise_at(problem, state, np.tile(which, 2), np.concatenate([move, alone]))[0].reshape(2, -1)
     move = np.where((rise[0] <= rise[1])[:, None], move, alone)
-    rise, there = _rise_at(problem, state, which, move, with_slopes=True)
+    rise, there = rise_at(problem, state, which, move, with_slopes=True)
     stepped = move + step_of_others(problem, there.sums, axes.held)[0]
-    least = _rise_at(problem, state, which, stepped)[0]
+    least = rise_at(problem, state, which, stepped)[0]
     return np.minimum(rise, least), np.where((rise <= least)[:, None], move, stepped)
