@@ -78,7 +78,8 @@ class Match:
     p_value : float
         Probability of a larger χ² if the model is right.
     class_probability : mapping of str to float
-        Of each class, over all of its views, and of "none".
+        Of each class, over all of its views, and of "none". Method "nearest" weighs the nearest image of each class
+        alone: among look-alikes it is too sure.
     alternatives : tuple of Candidate
         The best of each other class, and further modes of the likelihood, best first.
     symmetry : int

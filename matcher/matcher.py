@@ -294,7 +294,7 @@ class Matcher:
             raise UsageError(
                 f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'
             )
-        frames = self.read_out(frames).without_offset().with_pooled_noise()
+        frames = self.read_out(frames).without_offset().with_pooled_noise().with_fixed_pattern()
         if self.method == "nearest" and frames.tilts_rad.any():
             raise UsageError('frames with a tilt take method="refine": the images of a bank are level')
         if on == "reported":
@@ -362,7 +362,7 @@ class Matcher:
             own = (one for one in self._by_evidence if kinds.get(one.options["background"], True))
             return next(own, self._by_evidence[0]).track(frames, near)
         assert isinstance(self._method, LikelihoodMatcher)
-        frames = self.read_out(frames).without_offset().with_pooled_noise()
+        frames = self.read_out(frames).without_offset().with_pooled_noise().with_fixed_pattern()
         if self.options["on"] == "reported":
             frames = frames.with_chip_error()
         found = self._method.track(frames if self._one is None else self._of_one_frequency(frames, self._one), near)

@@ -89,6 +89,23 @@ def test_interpolated_images_are_rendered_ones_within_a_fraction_of_the_noise(ba
     assert np.abs(whitened).max() < 3
 
 
+def test_a_fixed_pattern_that_the_sensor_states_is_noise_that_no_mean_lessens(bank, matcher_of):
+    rng, squares, n = np.random.default_rng(8), [], 24
+    for k in range(n):
+        sensor = bank.sensor.with_(phase_offset_std_rad=0.0025, tap_phase_offset_std_rad=0.0025, unit_seed=k + 1)
+        view = rng.uniform(0.8, 1.4), rng.uniform(0, math.pi)
+        image = Renderer(bank.mesh("post"), sensor, albedo=0.8).render(*view)
+        (match,) = matcher_of(free=VIEW[:2]).match(kalman_filter(capture(image, sensor, rng=rng, n_frames=50)))
+        error = np.array(
+            [match.distance_m - view[0], math.remainder(match.delta_rad - view[1], math.tau / match.symmetry)]
+        )
+        if match.accepted:
+            squares.append(error @ np.linalg.solve(match.covariance, error))
+    assert len(squares) >= n - 2  # none without it
+    low, high = stats.chi2.ppf([0.001, 0.999], 2 * len(squares))
+    assert low < sum(squares) < high
+
+
 def test_interpolated_slopes_are_those_of_the_interpolated_images(bank):
     model = BankModel(bank)
     view = np.array([[1.0137, 0.6512, 0, 0], [1.2651, 3.1379, 0, 0]])  # the second beyond the last angle of the grid

@@ -552,7 +552,7 @@ class StillFit:
 
 
 def _with_noise_of_the_law(evidence: Evidence, frames: FilteredFrames, images: Images) -> Evidence:
-    """Return ranges with the noise that the law tells of the light of model images, which edges and slopes lessen."""
+    """Return ranges with the noise that the law has for the light of model images, which edges and slopes lessen."""
     std = np.maximum(predicted_range_std(np.abs(images.phasor), images.intensity, evidence.sensor), 1e-4)
     count = frames.n_effective.reshape(std.shape)
     return replace(evidence, weight=np.where(evidence.weight > 0, count / std**2, 0.0))

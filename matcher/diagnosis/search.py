@@ -202,7 +202,7 @@ def _starts(class_index: NDArray[np.int64], view: _Float) -> Starts:
 
 def pooled_evidence(frame: FilteredFrames) -> Evidence:
     """Return one frame with the noise of its pixels taken together."""
-    return Evidence.from_frames(frame.with_pooled_noise(), "ranges")
+    return Evidence.from_frames(frame.with_pooled_noise().with_fixed_pattern(), "ranges")
 
 
 def _with_slack(evidence: Evidence, slack_m: float) -> Evidence:

@@ -171,6 +171,22 @@ class FilteredFrames:
             by_frequency=tuple(part.without_offset() for part in self.by_frequency),
         )
 
+    def with_fixed_pattern(self) -> FilteredFrames:
+        """Return frames whose noise holds the fixed pattern that their sensor states, which no mean lessens.
+
+        Offsets of the two taps of a pixel turn its phase by their mean.
+        """
+        sensor, parts = self.sensor, tuple(part.with_fixed_pattern() for part in self.by_frequency)
+        of_pattern_m = sensor.range_per_phase_noise_m * math.hypot(
+            sensor.phase_offset_std_rad, sensor.tap_phase_offset_std_rad / math.sqrt(2)
+        )
+        if not of_pattern_m:
+            return self
+        std_m = np.hypot(self.std_m, of_pattern_m)
+        share = np.divide(self.std_m, std_m, out=np.ones(std_m.shape), where=np.isfinite(std_m)) ** 2
+        worth = self.n_effective if self.std_from_scatter else self.n_effective * share  # of the scatter: its freedom
+        return replace(self, std_m=std_m, n_effective=worth, by_frequency=parts)
+
     @property
     def chip_error_m(self) -> float:
         """Error of a chip's target beside its noise, metres: rounding, and what it makes of a surface that bends."""

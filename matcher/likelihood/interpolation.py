@@ -1,8 +1,7 @@
-"""Whether answers from images that are interpolated from a bank are those that the landmark has.
+"""Answers from images that are interpolated from a bank, tried on rendered ones.
 
 A surface that comes into view inside a cell of the bank, behind an edge or at the end of a gap, makes the range of a
-pixel jump there; no interpolation follows, and its slope claims what nothing shows. So answers are tried on rendered
-images.
+pixel jump there; no interpolation follows, and its slope claims more than anything shows.
 """
 
 from __future__ import annotations
