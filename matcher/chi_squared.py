@@ -17,11 +17,10 @@ def noise_tails(frames: FilteredFrames) -> NDArray[np.float64]:
     scaled that law, what the median of their χ² over ν leaves unknown of it: 1 / (8 m² f²) with the median m of χ² at ν
     and its density f there, however many pixels there are.
     """
-    n = np.where(frames.n_effective > 0, frames.n_effective, np.nan).reshape(len(frames), -1)
-    nu = np.array([np.nanmedian(row) if np.isfinite(row).any() else 0.0 for row in n]) - 1
     if not frames.std_from_scatter:
         tails = np.tile([np.inf, frames.sensor.overdispersion], (len(frames), 1))
         if frames.std_is_pooled:
+            nu = _usual_count(frames) - 1
             scattered = nu > 0.5
             half = nu[scattered] / 2
             median = special.chdtri(2 * half, 0.5)
@@ -29,7 +28,16 @@ def noise_tails(frames: FilteredFrames) -> NDArray[np.float64]:
             tails[scattered, 1] += 1 / (8 * (median * density) ** 2)
         return tails
     # the variance of F(1, ν) exists above 4
-    return np.column_stack([np.maximum(nu, 5.0), np.zeros(len(nu))])
+    return np.column_stack([np.maximum(_usual_count(frames) - 1, 5.0), np.zeros(len(frames))])
+
+
+def _usual_count(frames: FilteredFrames) -> NDArray[np.float64]:
+    """Return how many exposures the pixels of each frame are worth in the median of those that are any, (n,)."""
+    count = frames.n_effective.reshape(len(frames), -1)
+    known = (count > 0).sum(axis=1)
+    ordered = np.sort(np.where(count > 0, count, np.inf), axis=1)
+    middle = [ordered[np.arange(len(known)), np.maximum(rank, 0) // 2] for rank in (known - 1, known)]
+    return np.where(known > 0, (middle[0] + middle[1]) / 2, 0.0)
 
 
 def p_values_of(
