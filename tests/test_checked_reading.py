@@ -214,6 +214,7 @@ FOREIGN = {
     "truth.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (True, 16, 16), }", bytes(2048)),
     "large.npy": npy("{'descr': '<f8', 'fortran_order': False, 'shape': (4000000000, 16, 16), }", bytes(2048)),
     "record.npy": npy("{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1, 16, 16), }", bytes(2048)),
+    "two.npy": 2 * npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1, 16, 16), }", np.ones(256).tobytes()),
     "lzma.npz": damaged_lzma(),
     "wide.png": png(65535, 65535),
     "widest.png": png(2**31 - 1, 2**31 - 1),

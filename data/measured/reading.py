@@ -431,7 +431,10 @@ def _read_open(
     if start.startswith(b"\x93NUMPY"):
         _Room(path, size).take("range", *_npy_header(file))
         file.seek(0)
-        return Recording({"range": np.lib.format.read_array(file, allow_pickle=False)})
+        only = np.lib.format.read_array(file, allow_pickle=False)
+        if more := size - file.tell():
+            raise InputFileError(f"{path}: {more} bytes follow its array: give several arrays as .npz")
+        return Recording({"range": only})
     if start.startswith(b"PK"):
         return _read_npz(file, size, path)
     if start == b"\x89PNG\r\n\x1a\n":

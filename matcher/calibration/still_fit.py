@@ -405,12 +405,13 @@ class StillFit:
         def cost(log: _Float) -> float:
             return effects.minus_two_log(np.exp(log)[[0, 0, 1, 2]])  # a lens moves along and across
 
-        found = [
-            optimize.minimize(
-                cost, start, method="Nelder-Mead", bounds=_STD_BOUNDS, options={"xatol": 0.02, "fatol": 0.02}
-            )
-            for start in _STD_STARTS
-        ]
+        with np.errstate(invalid="ignore"):  # of poses that go with nothing all sizes may cost infinitely much
+            found = [
+                optimize.minimize(
+                    cost, start, method="Nelder-Mead", bounds=_STD_BOUNDS, options={"xatol": 0.02, "fatol": 0.02}
+                )
+                for start in _STD_STARTS
+            ]
         best = min(found, key=lambda one: float(one.fun))
         return PoseStd(*np.exp(best.x).tolist())
 
