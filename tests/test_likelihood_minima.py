@@ -310,3 +310,21 @@ def test_images_that_no_interpolation_follows_make_no_answer(tmp_path):
     squares = np.einsum("kp,kpq,kq->k", errors, np.linalg.inv(claimed), errors)
     low, high = chi2.ppf([0.001, 0.999], 2 * len(squares)) / len(squares)
     assert low < squares.mean() < 1.15 * high  # of 2 in expectation; off by 286 times without the test
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("exposures", [50, 400])
+def test_random_parts_on_the_default_grid_have_the_covariance_that_is_stated(exposures, tmp_path):
+    n, squares, rng = 40, [], np.random.default_rng(31)
+    for k, (kind, mesh) in enumerate(parts_of(30, 14)):
+        with bank_of(tmp_path, {f"{kind}{k}": mesh}, "0.6:1.1:0.01", "0:360:1") as bank:
+            views = Views.broadcast(rng.uniform(0.7, 1.0, n), rng.uniform(0, math.tau, n))
+            matches = Matcher(bank, "refine", free=FIXED).match(frames_of(bank, f"{kind}{k}", views, exposures, k))
+            for match, distance_m, delta_rad in zip(matches, views.distance_m, views.delta_rad, strict=True):
+                if match.accepted:
+                    turned = math.remainder(match.delta_rad - delta_rad, math.tau / match.symmetry)
+                    error = np.array([match.distance_m - distance_m, turned])
+                    squares.append(float(error @ np.linalg.pinv(match.covariance) @ error))
+    assert len(squares) > 200
+    assert np.mean(squares) < 1.15 * chi2.ppf(0.999, 2 * len(squares)) / len(squares)  # of 2
+    assert max(squares) < chi2.isf(1e-3 / len(squares), 2)
