@@ -302,7 +302,13 @@ def test_images_that_no_interpolation_follows_make_no_answer(tmp_path):
         matcher = Matcher(bank, "refine", free=FIXED)
         for exposures in (50, 400):
             views = Views.broadcast(np.full(n, 0.8486), math.radians(307.67))
-            for match in matcher.match(frames_of(bank, "shelf", views, exposures, 1)):
+            frames = frames_of(bank, "shelf", views, exposures, 1)
+            matches = matcher.match(frames)
+            tracked = matcher.track(frames[:1], matches[:1])
+            off_rad = tracked.delta_rad - matches[0].delta_rad
+            assert abs(off_rad) < 0.1 * math.sqrt(tracked.covariance[1, 1])
+            assert tracked.covariance[1, 1] == pytest.approx(matches[0].covariance[1, 1], rel=0.2)
+            for match in matches:
                 if match.accepted:
                     errors.append([match.distance_m - 0.8486, match.delta_rad - math.radians(307.67)])
                     claimed.append(match.covariance)

@@ -127,7 +127,7 @@ class LikelihoodMatcher:
         names = list(setup.rules.names)
         classes = np.array([names.index(one.class_name) for one in near if one.class_name is not None], np.int64)
         views = np.array([[getattr(one, name) for name in VIEW] for one in near])
-        scene, behind = self.scenes.stated, setup.stated
+        scene, behind = self.scenes.on_rendered(), setup.stated
         if setup.auto:
             behind = near[0].background
             if behind is not None and behind.wall_m is not None:
