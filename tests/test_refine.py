@@ -102,6 +102,10 @@ def test_a_fixed_pattern_that_the_sensor_states_is_noise_that_no_mean_lessens(ba
         if match.accepted:
             squares.append(error @ np.linalg.solve(match.covariance, error))
     assert len(squares) >= n - 2  # none without it
+    pattern = bank.sensor.with_(phase_offset_std_rad=0.01, unit_seed=1)  # 24 mm: of 200 frames no more than of one
+    image = Renderer(bank.mesh("post"), pattern, albedo=0.8).render(1.0, 0.3)
+    ranges = Frames(capture(image, pattern, rng=rng, n_frames=200).range_m, sensor=pattern)
+    assert matcher_of(free=VIEW[:2]).match(kalman_filter(ranges))[0].class_name is not None
     low, high = stats.chi2.ppf([0.001, 0.999], 2 * len(squares))
     assert low < sum(squares) < high
 

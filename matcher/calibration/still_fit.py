@@ -83,10 +83,12 @@ def solve_still(problem: Problem, pose_std: PoseStd | None) -> Solution:
     check_poses(problem)
     frames, poses, model = problem.frames, problem.poses, problem.model()
     frames = replace(frames, range_m=frames.range_m - problem.sensor.zone_offsets)  # the range offset is estimated
+    frames = frames.with_fixed_pattern()
     evidence = Evidence.from_frames(frames, problem.on)
     check_view(model, evidence, problem.assumed)
     edges = model.has_background or not returns_beside(model, evidence)
-    noise_measured = frames.amplitude_e is not None or frames.std_from_scatter or problem.sensor.kind == "direct"
+    scattered = problem.frames.std_from_scatter
+    noise_measured = frames.amplitude_e is not None or scattered or problem.sensor.kind == "direct"
 
     def fit_with(std: PoseStd | None) -> StillFit:
         factor = None if std is None or std.exact else std.factor(poses)
@@ -129,7 +131,7 @@ def _solution(
 ) -> Solution:
     """Return the result of a fit; `estimated` are the pose errors found from the residuals, if they were."""
     poses, use = problem.poses, place.use
-    information, scatter, lasting = fit.knowledge(place)
+    information, scatter, lasting = fit.knowledge(place, frames.pattern_m)
     try:
         check_observable(information, fit.free, fit.scale, poses)
     except UsageError as error:  # all numbers could be determined where the fit began
@@ -152,8 +154,9 @@ def _solution(
         else:
             covariance = covariance * excess
             source += f", scaled by χ² = {excess:.3g} for each degree of freedom, for the residuals are more than noise"
-        covariance = covariance + plain @ lasting @ plain
         notes += sentences.misfit_notes(excess, p_value, poses, pose_chi2 / np.maximum(count, 1))
+    if p_value < FALSE_ALARM or frames.pattern_m:
+        covariance = covariance + plain @ lasting @ plain
     notes += sentences.unused_notes(fit.edges, poses, count)
     notes += sentences.observability_notes(fit.free, covariance, fit.scale, poses)
     before, after = (
@@ -358,8 +361,14 @@ class StillFit:
                 break
         return self._with_its_pixels(place)
 
-    def knowledge(self, place: Place) -> tuple[_Float, _Float, _Float]:
+    def knowledge(self, place: Place, pattern_m: float = 0.0) -> tuple[_Float, _Float, _Float]:
         """Return the information of a place, from slopes that no corner and no faint pixel distort, and its scatter.
+
+        Parameters
+        ----------
+        place : Place
+        pattern_m : float
+            Standard deviation of a fixed pattern that is known to be in the ranges; 0: the residuals tell it.
 
         Returns
         -------
@@ -373,9 +382,10 @@ class StillFit:
         linear = self._linearise_wide(place, _WIDTHS)
         pull = self._pull(place)
         by_pose, _ = linear.gradients(pull, place.u)
-        own = (linear.rows * pull[:, None]).reshape(len(pull), len(self.free), self.evidence.per_pixel, -1).sum(axis=2)
-        by_pixel = own.sum(axis=0) / self.scale[:, None]
+        alike = pattern_m * np.sqrt(self.evidence.weight) if pattern_m and self.evidence.on == "ranges" else pull
+        own = (linear.rows * alike[:, None]).reshape(len(pull), len(self.free), self.evidence.per_pixel, -1).sum(axis=2)
         own = own / self.scale[:, None]
+        by_pixel = own.sum(axis=0)
         value, vectors = np.linalg.eigh(by_pixel @ by_pixel.T - np.einsum("kpr,kqr->pq", own, own))
         axes = self.scale[:, None] * vectors * np.sqrt(np.maximum(value, 0.0))
         return linear.information, by_pose.T @ by_pose, axes @ axes.T

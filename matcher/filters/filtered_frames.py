@@ -171,21 +171,28 @@ class FilteredFrames:
             by_frequency=tuple(part.without_offset() for part in self.by_frequency),
         )
 
-    def with_fixed_pattern(self) -> FilteredFrames:
-        """Return frames whose noise holds the fixed pattern that their sensor states, which no mean lessens.
+    @property
+    def pattern_m(self) -> float:
+        """Standard deviation of the fixed pattern that the sensor states, metres.
 
         Offsets of the two taps of a pixel turn its phase by their mean.
         """
-        sensor, parts = self.sensor, tuple(part.with_fixed_pattern() for part in self.by_frequency)
-        of_pattern_m = sensor.range_per_phase_noise_m * math.hypot(
-            sensor.phase_offset_std_rad, sensor.tap_phase_offset_std_rad / math.sqrt(2)
-        )
-        if not of_pattern_m:
+        sensor = self.sensor
+        of_pixel_rad, of_tap_rad = sensor.phase_offset_std_rad, sensor.tap_phase_offset_std_rad
+        return sensor.range_per_phase_noise_m * math.hypot(of_pixel_rad, of_tap_rad / math.sqrt(2))
+
+    def with_fixed_pattern(self) -> FilteredFrames:
+        """Return frames whose noise holds the fixed pattern that their sensor states, which no mean lessens."""
+        if not self.pattern_m:
             return self
-        std_m = np.hypot(self.std_m, of_pattern_m)
+        parts = tuple(part.with_fixed_pattern() for part in self.by_frequency)
+        std_m = np.hypot(self.std_m, self.pattern_m)
         share = np.divide(self.std_m, std_m, out=np.ones(std_m.shape), where=np.isfinite(std_m)) ** 2
-        worth = self.n_effective if self.std_from_scatter else self.n_effective * share  # of the scatter: its freedom
-        return replace(self, std_m=std_m, n_effective=worth, by_frequency=parts)
+        told = share[self.n_effective > 0]
+        scattered = self.std_from_scatter and told.size > 0 and float(np.median(told)) > 0.5  # the rest is known
+        return replace(
+            self, std_m=std_m, n_effective=self.n_effective * share, std_from_scatter=scattered, by_frequency=parts
+        )
 
     @property
     def chip_error_m(self) -> float:

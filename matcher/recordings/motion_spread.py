@@ -22,8 +22,8 @@ from phasemark.render import Frames, Renderer, Views
 
 _PARTS, _FALSE_ALARM = 5, 1e-3
 """Parts that the frames of a position are matched in, and the probability of that where nothing moved."""
-_COSINES, _FEWEST_FRAMES = 4, 5
-"""Of time, in which slow motion is looked for: up to two swings; and frames below which they say next to nothing."""
+_COSINES, _FEWEST_FRAMES = 8, 5
+"""Of time, in which slow motion is looked for, two or three swings; and frames below which they say next to nothing."""
 
 
 def with_motion_spread(
@@ -108,14 +108,16 @@ def _whitened_steps(
 def _slow_p_value(steps: NDArray[np.float64]) -> float:
     """Return the p-value of what the first cosines of time have of steps (n, p), by F and Bonferroni."""
     n, p = steps.shape
-    count = np.arange(1, min(_COSINES, (n - 1) // 2) + 1)
-    cosines = np.cos(np.pi / n * count[:, None] * (np.arange(n) + 0.5)) * math.sqrt(2 / n)
-    slow = np.square(cosines @ steps).sum(axis=1).cumsum()
-    rest = np.square(steps).sum() - slow
+    count = np.arange(1, min(_COSINES, (n - 1) // 2) + 1)[:, None]
+    cosines = np.cos(np.pi / n * count * (np.arange(n) + 0.5)) * math.sqrt(2 / n)
+    slow, whole = np.square(cosines @ steps).cumsum(axis=0), np.square(steps).sum(axis=0)
+    # along each axis, and along all together
+    slow, whole = np.column_stack([slow, slow.sum(axis=1)]), np.append(whole, whole.sum())
+    rest, axes = whole - slow, np.append(np.ones(p), p)
     if not (p and (rest > 0).all()):
         return 1.0
     ratio = slow / count / (rest / (n - 1 - count))
-    return float(len(count) * special.fdtrc(count * p, (n - 1 - count) * p, ratio).min())
+    return float(slow.size * special.fdtrc(count * axes, (n - 1 - count) * axes, ratio).min())
 
 
 def _with_spread(
