@@ -233,10 +233,10 @@ class Scenes:
         fixed = setup.free == VIEW[:2]
         alone = setup.on == "ranges" and self._setup.stated is None
         chip = setup.reports_one_surface  # its ranges jump between the nodes of a bank, and its strips need no tilt
-        plain = alone and not (chip or setup.auto or setup.unknown or setup.huber is not None)
-        interpolates = fixed and plain and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
+        fine = fixed and alone and not chip and BankModel.grid_is_fine_enough(self._bank, *_FINE_GRID)
+        interpolates = fine and not (setup.auto or setup.huber is not None)
         level = setup.free in (VIEW[:2], VIEW[:3]) or (chip and "height_m" not in setup.free)
-        has_strips = alone and not interpolates and level
+        has_strips = alone and level and not (interpolates or (fine and setup.auto))  # strips have no background
         if has_strips and StripModel.suits(self._bank, self.search.widest_columns):
             return None, StripModel(self._bank, self.search.widest_columns)
         scouts = fixed and BankModel.grid_is_fine_enough(self._bank, *_COARSE_GRID)
