@@ -33,6 +33,7 @@ from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Background, Frames, Renderer, Sensor
 from phasemark.render.direct.histogram_frames import HistogramFrames
 from phasemark.render.direct.targets import Targets
+from phasemark.render.threads import check_workers
 
 METHODS = ("nearest", "refine")
 Measured = Literal["ranges", "reported", "phasors", "histograms", "targets"]
@@ -163,8 +164,8 @@ class Matcher:
         _check_word("pixels", pixels, ("all", "lower"))
         if not isinstance(robust, bool | np.bool_):
             raise UsageError(f"'robust' must be True or False, got {robust!r}")
-        if workers is not None and not workers >= 1:
-            raise UsageError(f"'workers' must be at least 1, or None, got {workers!r}")
+        if workers is not None:
+            check_workers(workers)
         if background is not None and not isinstance(background, Background):
             _check_word("background", background, ("auto", "unknown", "any"), "a Background, None, ")
         stated = {

@@ -36,6 +36,7 @@ from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.phasor_images import PhasorImages
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
+from phasemark.render.threads import check_workers
 from phasemark.render.view import VIEW_FIELDS, Footprint, Views
 
 if TYPE_CHECKING:
@@ -454,8 +455,7 @@ class Renderer:
 
     def _checked(self, views: Views, background: Backgrounds, workers: int) -> NDArray[np.float64]:
         """Refuse what cannot be rendered; return what stands behind each view, (n, 4)."""
-        if workers < 1:
-            raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        check_workers(workers)
         return self.check_can_be_seen(views, background)
 
     def check_can_be_seen(self, views: Views, background: Backgrounds) -> NDArray[np.float64]:

@@ -369,6 +369,7 @@ def test_moving_bodies_are_rendered_as_where_they_stand():
         np.testing.assert_array_equal(together.shares[k], alone.shares[0])
     np.testing.assert_array_equal(together.phasor, threads.phasor)
     np.testing.assert_array_equal(together.phasor, named.phasor)
+    assert renderer.phasors(cameras[:0]).shares.shape == (0, WIDE.rows, WIDE.cols, len(bodies))
 
 
 def test_the_mesh_of_a_ball_that_was_stretched_is_no_ball_any_more():
@@ -554,6 +555,10 @@ def test_a_file_with_materials_becomes_a_scene(tmp_path):
         (lambda: Scene([Body.sphere(1)]).posed(np.zeros((3, 3)), 1), "'bodies2world' must have shape"),
         (lambda: SceneRenderer("scene", WIDE), "'scene' must be a Scene"),  # type: ignore[arg-type]
         (lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).phasors(np.eye(3)), "'camera2world' must have shape"),
+        (
+            lambda: SceneRenderer(Scene([Body.sphere(1)]), WIDE).phasors(np.eye(4), workers=1.5),  # type: ignore[arg-type]
+            "'workers' must be at least 1, a whole number, got 1.5",
+        ),
     ],
 )
 def test_what_is_no_scene_is_refused_in_words(make, message):

@@ -219,11 +219,6 @@ class SceneFramesPlan(SensorPlan):
         """Whether the counts of each tap are stored, too."""
         return "taps" in self.keep
 
-    @property
-    def has_histograms(self) -> bool:
-        """Whether the sensor counts photons in bins."""
-        return self.build_sensor().histogram is not None
-
     def greatest_distances_m(self) -> dict[str, float]:
         """Return nothing: a plan of scenes does not say how far bodies are."""
         return {}

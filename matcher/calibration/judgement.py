@@ -200,6 +200,8 @@ def likely_cause(solution: Solution, doubts: Sequence[Doubt]) -> str:
 
 def cause_of_refusal(problem: Problem) -> str:
     """Return the likely cause of frames that do not fit at all, or nothing: as a part of a sentence."""
+    if problem.moving and any(one.frames.time_s is None or one.poses.time_s is None for one in problem.recordings):
+        return ""
     cause = _cause(_asked(problem), None, range(len(problem.recordings)), _alternatives)
     return f"; likely cause: {cause}" if cause else ""
 

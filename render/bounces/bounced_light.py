@@ -297,7 +297,7 @@ def check_bounces(bounces: Bounces, tolerance: float, sensor: Sensor) -> None:
     UsageError
     """
     check_number_of_bounces(bounces)
-    if not tolerance > 0:
+    if not (isinstance(tolerance, int | float) and tolerance > 0):
         raise UsageError(f"'bounce_tolerance' must be positive, got {tolerance!r}")
     if bounces:
         check_can_bounce(sensor)

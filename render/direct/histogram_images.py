@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from phasemark import UsageError
 from phasemark.render.background import Background
 from phasemark.render.direct.bin_counts import bin_response, counts_of_light, detected_counts
 from phasemark.render.direct.footprints import footprint_grid, histogram_of
@@ -23,7 +22,7 @@ from phasemark.render.integral.scene_samples import WALL, SceneMesh
 from phasemark.render.integral.surface_mesh import SurfaceMesh
 from phasemark.render.renderer import Renderer
 from phasemark.render.sensor.sensor import Sensor
-from phasemark.render.threads import mapped
+from phasemark.render.threads import check_workers, mapped
 from phasemark.render.view import Views
 
 if TYPE_CHECKING:
@@ -205,8 +204,7 @@ class HistogramRenderer:
         (n, 2, zones, bins) float64
             Landmark, background; stray light between zones included, pile-up not.
         """
-        if workers < 1:
-            raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        check_workers(workers)
         seen = views.in_camera(self.sensor)
         self._exact.check_can_be_seen(seen, background)
         histogram = histogram_of(self.sensor)

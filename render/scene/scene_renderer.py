@@ -27,7 +27,7 @@ from phasemark.render.scene.assembly import Assembly
 from phasemark.render.scene.scene import Scene
 from phasemark.render.sensor.frequencies import phasor_frequencies_hz
 from phasemark.render.sensor.sensor import Sensor, refuse_no_sensor
-from phasemark.render.threads import mapped
+from phasemark.render.threads import check_workers, mapped
 
 _TOUCH_M = 1e-9
 _MOST_BYTES = 4 << 30
@@ -205,7 +205,7 @@ class SceneRenderer:
     def _of_bodies(self, shares: NDArray[np.float64], shape: tuple[int, ...]) -> NDArray[np.float64]:
         """Return the shares of pixels of bodies, (*shape, b), from those of their pieces."""
         first = np.searchsorted(self._owner, np.arange(len(self.scene)))
-        return np.minimum(np.add.reduceat(shares.reshape(*shape, -1), first, axis=-1), 1.0)
+        return np.minimum(np.add.reduceat(shares.reshape(*shape, len(self._owner)), first, axis=-1), 1.0)
 
     def _sums(
         self,
@@ -299,7 +299,7 @@ class SceneRenderer:
         self._for_each_placing(count, cameras, self.scene.posed(bodies2world, n), background, workers)
         shape = n, sensor.rows, sensor.cols
         return HistogramImages(
-            detected_counts(signal, sensor).reshape(*shape, -1),
+            detected_counts(signal, sensor).reshape(*shape, histogram.bins),
             signal.sum(axis=-1).reshape(shape),
             sensor,
             shares=self._of_bodies(shares, shape),
@@ -326,8 +326,7 @@ class SceneRenderer:
         workers: int,
     ) -> None:
         """Call `use` once for all frames in which the bodies stand alike, from several threads where they do not."""
-        if workers < 1:
-            raise UsageError(f"'workers' must be at least 1, got {workers!r}")
+        check_workers(workers)
         n = len(cameras)
         alike: dict[bytes, list[int]] = {}
         for k in range(n):
