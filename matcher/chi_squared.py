@@ -13,25 +13,18 @@ def noise_tails(frames: FilteredFrames) -> NDArray[np.float64]:
     """Return what widens the law of χ² of each frame, (n, 2).
 
     The first is ν where the variances were estimated from the scatter of ν + 1 exposures, infinite elsewhere; the
-    second the `overdispersion` of the sensor where they are those of its noise law, and where the scatter of all pixels
-    scaled that law, what the median of their χ² over ν leaves unknown of it: 1 / (8 m² f²) with the median m of χ² at ν
-    and its density f there, however many pixels there are.
+    second the `overdispersion` of the sensor where they are those of its noise law, and that of the frames beside it.
     """
     if not frames.std_from_scatter:
         tails = np.tile([np.inf, frames.sensor.overdispersion], (len(frames), 1))
-        if frames.std_is_pooled:
-            nu = _usual_count(frames) - 1
-            scattered = nu > 0.5
-            half = nu[scattered] / 2
-            median = special.chdtri(2 * half, 0.5)
-            density = np.exp((half - 1) * np.log(median / 2) - median / 2 - special.gammaln(half)) / 2
-            tails[scattered, 1] += 1 / (8 * (median * density) ** 2)
+        if frames.overdispersion is not None:
+            tails[:, 1] += frames.overdispersion
         return tails
     # the variance of F(1, ν) exists above 4
-    return np.column_stack([np.maximum(_usual_count(frames) - 1, 5.0), np.zeros(len(frames))])
+    return np.column_stack([np.maximum(usual_count(frames) - 1, 5.0), np.zeros(len(frames))])
 
 
-def _usual_count(frames: FilteredFrames) -> NDArray[np.float64]:
+def usual_count(frames: FilteredFrames) -> NDArray[np.float64]:
     """Return how many exposures the pixels of each frame are worth in the median of those that are any, (n,)."""
     count = frames.n_effective.reshape(len(frames), -1)
     known = (count > 0).sum(axis=1)

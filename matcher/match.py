@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.data.pages.notebook import table_html
-from phasemark.render import Background
+from phasemark.render import Background, Views
 from phasemark.render.integral.rounding import with_error
+from phasemark.render.view import VIEW_FIELDS
 
 _T = TypeVar("_T", bound=np.generic)
 Reason = Literal["", "no landmark", "poor fit", "undetermined", "outside the bank", "ambiguous"]
@@ -202,6 +203,11 @@ class Match:
     def _repr_html_(self) -> str:
         """Show the match in a notebook."""
         return table_html(_COLUMNS, [_cells(self)])
+
+
+def views_of(matches: Sequence[Match]) -> Views:
+    """Return the views of answers that have a class."""
+    return Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW_FIELDS))
 
 
 def named_in_degrees(name: str) -> str:

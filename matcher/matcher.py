@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Literal, cast
 
@@ -13,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from phasemark import UsageError
 from phasemark.data import Bank
+from phasemark.matcher.chi_squared import usual_count
 from phasemark.matcher.estimate.acceptance import Rules, with_parts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
 from phasemark.matcher.filters.region import read_region
@@ -27,7 +29,7 @@ from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPol
 from phasemark.matcher.likelihood.setup import BEARING_STD_RAD, TILT_STD_RAD, Pixels, check_free, setup_of
 from phasemark.matcher.likelihood.shared_errors import with_motion
 from phasemark.matcher.likelihood.systematic import SYSTEMATICS, carried_errors, check_systematic, declared_covariance
-from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches
+from phasemark.matcher.match import TOLERANCE_M, TOLERANCE_RAD, Match, Matches, views_of
 from phasemark.matcher.nearest.nearest_matcher import NearestMatcher
 from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.render import Background, Frames, Renderer, Sensor
@@ -295,12 +297,33 @@ class Matcher:
             raise UsageError(
                 f'on="{on}" takes filtered frames: match histograms on="histograms", or their targets on="targets"'
             )
-        frames = self.read_out(frames).without_offset().with_pooled_noise().with_fixed_pattern()
+        frames = self.read_out(frames).without_offset()
         if self.method == "nearest" and frames.tilts_rad.any():
             raise UsageError('frames with a tilt take method="refine": the images of a bank are level')
-        if on == "reported":
+        found = self._method.match(self._with_noise(frames))
+        if guessed := _of_unknown_noise(frames, found):
+            again = self._method.match(self._with_noise(frames[guessed], [found[k] for k in guessed]))
+            for k, answer in zip(guessed, again, strict=True):
+                found[k] = answer
+        return Matches(found)
+
+    def _with_noise(self, frames: FilteredFrames, seen: Sequence[Match] = ()) -> FilteredFrames:
+        """Return frames as they are compared, of noise that few of them tell with that in the light of answers."""
+        light = np.zeros((2, *frames.range_m.shape))
+        for name in sorted({match.class_name for match in seen if match.class_name is not None}):
+            which, renderer = [k for k, match in enumerate(seen) if match.class_name == name], self.renderer(name)
+            views = views_of([seen[k] for k in which])
+            aimed = views.in_camera(renderer.sensor)
+            behind = [
+                own and replace(own, bounces=0).giving_way(renderer.footprint, aimed[i : i + 1])
+                for i, own in enumerate(seen[k].background for k in which)
+            ]
+            image = renderer.render_views(views, background=behind)
+            light[:, which] = image.amplitude, image.intensity
+        frames = frames.with_pooled_noise((light[0], light[1])).with_fixed_pattern()
+        if self.options["on"] == "reported":
             frames = frames.with_chip_error()
-        return Matches(self._method.match(frames if self._one is None else self._of_one_frequency(frames, self._one)))
+        return frames if self._one is None else self._of_one_frequency(frames, self._one)
 
     def renderer(self, class_name: str) -> Renderer:
         """Return what renders a landmark of the bank, with what matching has computed of the light around it.
@@ -363,10 +386,9 @@ class Matcher:
             own = (one for one in self._by_evidence if kinds.get(one.options["background"], True))
             return next(own, self._by_evidence[0]).track(frames, near)
         assert isinstance(self._method, LikelihoodMatcher)
-        frames = self.read_out(frames).without_offset().with_pooled_noise().with_fixed_pattern()
-        if self.options["on"] == "reported":
-            frames = frames.with_chip_error()
-        found = self._method.track(frames if self._one is None else self._of_one_frequency(frames, self._one), near)
+        frames = self.read_out(frames).without_offset()
+        seen = near[:1] if _of_unknown_noise(frames, near[:1]) else ()
+        found = self._method.track(self._with_noise(frames, seen), near)
         return with_parts(self._method.setup.rules, found, dict(near[0].systematic))
 
     def match_jointly(self, frames: HistogramFrames, camera2world: ArrayLike) -> Match:
@@ -510,6 +532,15 @@ class Matcher:
             if difference is None:
                 return read_region(frames, bank.region)
         raise UsageError(f"the frames were taken with another sensor than the bank's: {difference}")
+
+
+def _of_unknown_noise(frames: FilteredFrames, answers: Sequence[Match]) -> list[int]:
+    """Return which frames of a phase camera say little of their noise, of those whose answer tells their light."""
+    if frames.sensor.kind != "phase" or not frames.std_from_scatter or frames.amplitude_e is not None:
+        return []
+    enough = 50.0  # exposures of which the scatter of a pixel says as much as a law
+    few = usual_count(frames) < enough
+    return [k for k, answer in enumerate(answers) if few[k] and answer.class_name is not None]
 
 
 def _check_word(name: str, value: object, words: tuple[str, ...], before: str = "") -> None:

@@ -7,6 +7,7 @@ from scipy import stats
 from phasemark import UsageError
 from phasemark.matcher import FilteredFrames, PixelKalman, kalman_filter, phasor_mean
 from phasemark.matcher.filters import PixelState, kalman, kalman_step
+from phasemark.matcher.filters.pooled_noise import moderated
 from phasemark.render import (
     Flag,
     Frames,
@@ -441,3 +442,22 @@ def test_pixel_kalman_refuses_frames_unlike_the_ones_before():
     with pytest.raises(UsageError, match="'amplitude_e' must come with every frame or none: given with the frame"):
         recursive.update(series([1.0], amplitude_e=[5.0]))
     assert recursive.result().n_effective.item() == 1  # what was refused left no trace
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.5, math.inf])
+def test_variances_of_few_frames_and_a_law_add_up_as_their_scatter_about_it_allows(spread):
+    """Factors 1 / χ²(d) · d on the law: mean squared errors over the variances are 1, and their weights are as good."""
+    rng, pixels, nu = np.random.default_rng(3), 4000, 3
+    d = {0.0: 1e9, 0.5: 8.0, math.inf: 0.3}[spread]
+    law = np.exp(rng.normal(size=(1, pixels)))
+    true = 2.5 * law * d / rng.chisquare(d, (1, pixels))
+    sample = true * rng.chisquare(nu, (1, pixels)) / nu
+    found, more = moderated(sample, np.full((1, pixels), float(nu)), law)
+    if spread == 0.0:
+        np.testing.assert_allclose(found, 2.5 * law, rtol=0.05)
+        assert more[0] == pytest.approx(0.5 * stats.loggamma(nu / 2).var(), abs=0.05)
+    elif spread == 0.5:
+        assert np.mean(true / found) == pytest.approx(1.0, abs=0.05)
+        assert np.mean(np.log(true / found) ** 2) < 0.5 * np.mean(np.log(true / sample) ** 2)
+    else:  # the law says nothing: as the scatter, with the tails of Student's t
+        assert np.median(found / sample) == pytest.approx(5 / 3, rel=0.15)

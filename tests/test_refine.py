@@ -110,6 +110,24 @@ def test_a_fixed_pattern_that_the_sensor_states_is_noise_that_no_mean_lessens(ba
     assert low < sum(squares) < high
 
 
+@pytest.mark.parametrize(("brightness", "fewest"), [(1.0, 36), (0.5, 25)])
+def test_ranges_alone_of_four_frames_have_an_honest_covariance(matcher_of, renderers, brightness, fewest):
+    """The scatter of four frames is a poor weight: NEES / 2 was 13.7, and the law knows no slopes and edges."""
+    rng, n = np.random.default_rng(6), 40
+    truth = Views.broadcast(rng.uniform(0.8, 1.1, n), rng.uniform(0, math.pi, n))
+    dim = SENSOR.with_(signal_e=brightness * SENSOR.signal_e)  # and matched as one that is stated to be brighter
+    lit = capture(renderers["cone"].render_views(truth), dim, rng=rng, n_frames=4)
+    matches = matcher_of(free=VIEW[:2]).match(kalman_filter(Frames(lit.range_m, sensor=SENSOR)))
+    off = np.column_stack(
+        [matches.distance_m - truth.distance_m, np.angle(np.exp(2j * (matches.delta_rad - truth.delta_rad))) / 2]
+    )
+    squares = [
+        own @ np.linalg.solve(match.covariance, own) for own, match in zip(off, matches, strict=True) if match.accepted
+    ]
+    assert len(squares) >= fewest
+    assert sum(squares) < stats.chi2.ppf(0.999, 2 * len(squares))
+
+
 def test_interpolated_slopes_are_those_of_the_interpolated_images(bank):
     model = BankModel(bank)
     view = np.array([[1.0137, 0.6512, 0, 0], [1.2651, 3.1379, 0, 0]])  # the second beyond the last angle of the grid

@@ -111,7 +111,7 @@ def test_blocks_add_up_phasors():
     phase = rng.uniform(0.5, 1.5, amplitude.shape)
     frames = frames_of(LARGE, amplitude, phase, 0.02)
     found = read_region(frames, region)
-    assert read_region(replace(frames, std_is_pooled=True), region).std_is_pooled
+    assert read_region(replace(frames, overdispersion=np.ones(1)), region).overdispersion == 1
     for row, col in ((0, 0), (5, 11), (23, 31)):
         block = np.s_[0, 4 + 3 * row : 7 + 3 * row, 8 + 3 * col : 11 + 3 * col]
         phasor = (amplitude[block] * np.exp(1j * phase[block])).sum()

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark import UsageError
+from phasemark.matcher.filters.pooled_noise import median_scaled, moderated
 from phasemark.render.phasor_images import PhasorImages, wrap_range_m
 from phasemark.render.png import figure_png
 from phasemark.render.sensor.range_noise import predicted_range_std
@@ -25,8 +26,12 @@ from phasemark.render.unwrapped_frames import unwrapped
 
 _ARRAYS = ("range_m", "std_m", "amplitude_e", "intensity_e", "state", "n_effective")
 """Fields of filtered frames with a number for each pixel."""
+_OF_POSITIONS = ("time_s", "tilt_rad", "overdispersion")
+"""Fields of filtered frames with a number, or two, for each position."""
 _USUAL_LIMIT_RAD = 0.1
 """Phase noise where a frame does not know its own and the sensor allows no less."""
+_LEAST_STD_M = 1e-4
+"""Noise of a range below which no law is believed."""
 
 
 class PixelState(IntEnum):
@@ -64,9 +69,9 @@ class FilteredFrames:
     std_from_scatter : bool
         True if `std_m` was estimated from the scatter of the frames themselves, with n − 1 degrees of freedom, rather
         than predicted from amplitude and intensity: tests then need F, not χ².
-    std_is_pooled : bool
-        True if the scatter of all pixels of a position together told the size of its noise,
-        :meth:`with_pooled_noise`: tests then have to allow for how well it did.
+    overdispersion : (n,) float64, optional
+        By how much χ² of each position scatters more than under noise of known size, where the scatter of its pixels
+        together told that size, :meth:`with_pooled_noise`: a factor on the variance of χ², less 1.
     time_s : (n,) float64, optional
         Mean time stamp of the frames at each position, seconds.
     tilt_rad : (n, 2) float64, optional
@@ -90,7 +95,7 @@ class FilteredFrames:
     n_effective: NDArray[np.float64]
     sensor: Sensor
     std_from_scatter: bool = False
-    std_is_pooled: bool = False
+    overdispersion: NDArray[np.float64] | None = None
     time_s: NDArray[np.float64] | None = None
     tilt_rad: NDArray[np.float64] | None = None
     by_frequency: tuple[FilteredFrames, ...] = ()
@@ -121,10 +126,10 @@ class FilteredFrames:
     ) -> FilteredFrames:
         """Return some of the positions; one position is still a batch, of one."""
         rows = index if isinstance(index, slice) else np.atleast_1d(index)
+        told = {name: array[rows] for name in _OF_POSITIONS if (array := getattr(self, name)) is not None}
         return self.with_arrays(
             lambda array: array[rows],
-            time_s=None if self.time_s is None else self.time_s[rows],
-            tilt_rad=None if self.tilt_rad is None else self.tilt_rad[rows],
+            **told,
             by_frequency=tuple(part[index] for part in self.by_frequency),
         )
 
@@ -139,11 +144,10 @@ class FilteredFrames:
         A field that one of them lacks all lack; noise is from the scatter of the frames if that of any is.
         """
         joined: dict[str, Any] = {}
-        for name in (*_ARRAYS, "time_s", "tilt_rad"):
+        for name in (*_ARRAYS, *_OF_POSITIONS):
             arrays = [getattr(part, name) for part in parts]
             joined[name] = None if any(array is None for array in arrays) else np.concatenate(arrays)
-        for name in ("std_from_scatter", "std_is_pooled"):
-            joined[name] = any(getattr(part, name) for part in parts)
+        joined["std_from_scatter"] = any(part.std_from_scatter for part in parts)
         return replace(parts[0], by_frequency=(), **joined)
 
     def with_pixels(self, move: Callable[[NDArray[Any]], NDArray[Any]]) -> FilteredFrames:
@@ -206,30 +210,40 @@ class FilteredFrames:
             return self
         return replace(self, std_m=np.hypot(self.std_m, self.chip_error_m))
 
-    def with_pooled_noise(self) -> FilteredFrames:
-        """Return the frames of a direct sensor with the noise of its law, scaled to the scatter of all pixels together.
+    def with_pooled_noise(self, light: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None) -> FilteredFrames:
+        """Return frames whose scatter alone tells their noise with what the scatter of all pixels together says of it.
 
-        The scatter of a few frames in one pixel is a poor measure of its noise. The law (`range_std_m` and its
-        neighbours in :class:`~phasemark.render.Sensor`) says how the noise of the pixels compares; the median over the
-        pixels of a position of scatter over law says how large it is. A single frame has the noise of the law.
+        The scatter of a few frames in one pixel is a poor measure of its noise. The law of the sensor says how the
+        noise of the pixels compares, and all of them together how large it is: for a direct sensor by the median of
+        scatter over law, for a phase camera, whose light the law has to guess, pixel by pixel as far as it guesses
+        well. A single frame has the noise of the law.
+
+        Parameters
+        ----------
+        light : (amplitude, intensity) of (n, rows, cols) float64, optional
+            Light of a model, relative to an albedo of 1 that faces the camera at 1 m; of no amplitude where it has
+            none. None: a surface of albedo 0.8 that faces the camera in every pixel.
         """
-        if self.sensor.kind != "direct" or not self.std_from_scatter:
+        if not self.std_from_scatter:
             return self
-        from scipy import special  # takes a fifth of a second
-
-        law = assumed_std_m(np.nan_to_num(self.range_m, nan=1.0), self.sensor)
-        n = self.n_effective
-        ratio = np.divide(self.std_m**2 * n, law**2, out=np.full(n.shape, np.nan), where=(n > 1.5) & (law > 0))
-        scale = np.ones((len(self), 1, 1))
-        for k in np.flatnonzero(np.isfinite(ratio).any(axis=(1, 2))):
-            scattered = np.isfinite(ratio[k])
-            freedom = float(np.median(n[k][scattered])) - 1
-            usual = float(special.chdtri(freedom, 0.5)) / freedom
-            scale[k] = float(np.median(ratio[k][scattered])) / usual
-        # least variance over that of the law; frames without any scatter are simulated, or frozen
-        least_pooled = 1e-4
-        std = np.sqrt(np.maximum(scale, least_pooled)) * law / np.sqrt(np.maximum(n, 1.0))
-        return replace(self, std_m=np.where(n > 0, std, np.nan), std_from_scatter=False, std_is_pooled=True)
+        n, range_m = self.n_effective, np.nan_to_num(self.range_m, nan=1.0)
+        law = assumed_std_m(range_m, self.sensor)
+        if light is not None:
+            lit = predicted_range_std(*light, self.sensor)
+            law = np.where(np.isfinite(lit), np.maximum(lit, _LEAST_STD_M), law)
+        told = np.isfinite(self.std_m) & (n > 0)
+        variance = np.where(told, self.std_m**2 * n, 0.0)
+        pool = median_scaled if self.sensor.kind == "direct" else moderated
+        flat = (array.reshape(len(self), -1) for array in (variance, np.where(told, n - 1, 0.0), law**2))
+        pooled, overdispersion = pool(*flat)
+        std = np.sqrt(pooled.reshape(n.shape) / np.maximum(n, 1.0))
+        return replace(
+            self,
+            std_m=np.where(n > 0, std, np.nan),
+            std_from_scatter=False,
+            overdispersion=overdispersion,
+            by_frequency=tuple(part.with_pooled_noise(light) for part in self.by_frequency),
+        )
 
     def _repr_png_(self) -> bytes | None:
         """Show range and standard deviation of the first position in a notebook; nothing where there is none."""
@@ -282,7 +296,7 @@ def unwrap_filtered(parts: Sequence[FilteredFrames], sensor: Sensor) -> Filtered
 def assumed_std_m(range_m: NDArray[np.float64], sensor: Sensor) -> NDArray[np.float64]:
     """Return the one-frame noise of a surface of albedo 0.8 that faces the camera at a range, metres."""
     amplitude = 0.8 / np.maximum(range_m, 1e-3) ** 2
-    return np.maximum(predicted_range_std(amplitude, amplitude, sensor), 1e-4)
+    return np.maximum(predicted_range_std(amplitude, amplitude, sensor), _LEAST_STD_M)
 
 
 def noise_free(images: PhasorImages, n_frames: float, returned: NDArray[np.bool_] | None = None) -> FilteredFrames:

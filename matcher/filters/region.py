@@ -80,7 +80,7 @@ def read_region(frames: FilteredFrames, region: Region) -> FilteredFrames:
         n_effective=np.where(seen, n_effective, 0.0),
         sensor=sensor,
         std_from_scatter=frames.std_from_scatter,
-        std_is_pooled=frames.std_is_pooled,
+        overdispersion=frames.overdispersion,
         time_s=frames.time_s,
         tilt_rad=frames.tilt_rad,
     )

@@ -24,9 +24,9 @@ from phasemark.matcher.likelihood.systematic import (
     fields_of,
     rates_of_views,
 )
-from phasemark.matcher.match import Match
+from phasemark.matcher.match import Match, views_of
 from phasemark.matcher.pixel_agreement import counts
-from phasemark.render import Renderer, Views
+from phasemark.render import Renderer
 from phasemark.render.view import delta_period_rad
 
 __all__ = ["with_motion", "with_shared_errors"]
@@ -107,7 +107,7 @@ def _carried(
 ) -> dict[Systematic, NDArray[np.float64]]:
     """Return what errors of the sensor's fields make of the views of some frames of one class, (k, p, p) each."""
     background, sensor, n = matches[0].background, evidence.sensor, len(matches)
-    views = Views(*(np.array([getattr(match, name) for match in matches]) for name in VIEW))
+    views = views_of(matches)
     image = renderer.render_views(views, background=background)
     parameters = (getattr(views, name) for name in VIEW)
     slope = renderer.jacobian(*parameters, background=background, parameters=setup.free)

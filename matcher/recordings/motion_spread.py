@@ -13,12 +13,11 @@ from scipy import special
 
 from phasemark.matcher.estimate.acceptance import Rules, with_parts
 from phasemark.matcher.filters.filtered_frames import FilteredFrames
-from phasemark.matcher.likelihood.images import VIEW
 from phasemark.matcher.likelihood.residuals import range_slopes
-from phasemark.matcher.match import Match, Matches
+from phasemark.matcher.match import Match, Matches, views_of
 from phasemark.matcher.matcher import Matcher
 from phasemark.matcher.recordings.stillness import motion_test, unwrapped_alike
-from phasemark.render import Frames, Renderer, Views
+from phasemark.render import Frames, Renderer
 
 _PARTS, _FALSE_ALARM = 5, 1e-3
 """Parts that the frames of a position are matched in, and the probability of that where nothing moved."""
@@ -85,9 +84,8 @@ def _of_views(matcher: Matcher, frames: Frames, filtered: FilteredFrames, matche
 
 def _range_slopes(renderer: Renderer, match: Match, free: Sequence[str]) -> NDArray[np.float64]:
     """Return how the ranges of all pixels change with the free parameters of an answer, (p, pixels)."""
-    view = Views(*(np.array([getattr(match, parameter)]) for parameter in VIEW))
     behind = None if match.background is None else replace(match.background, bounces=0)
-    image, slope = renderer.render_with_slopes(view, free, background=behind)
+    image, slope = renderer.render_with_slopes(views_of([match]), free, background=behind)
     phasor = image.phasor.reshape(1, -1)
     first = slope.reshape(len(free), -1, phasor.size)[None, :, 0]  # of several modulation frequencies
     return np.asarray(range_slopes(phasor, first, renderer.sensor.by_frequency[0])[0])
