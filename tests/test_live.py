@@ -33,7 +33,7 @@ from phasemark.cli import main
 from phasemark.data import BankPlan, build_bank
 from phasemark.landmarks import build_mesh, catalog
 from phasemark.matcher import Matcher, kalman_filter
-from phasemark.matcher.live import Live, Tracker, open_sink, open_source
+from phasemark.matcher.live import Live, Tracker, open_sink, open_source, sources
 from phasemark.matcher.live.map_tracker import MapTracker
 from phasemark.matcher.live.rig_frames import RecordedRig, RigLines, open_rig_source
 from phasemark.matcher.live.search_beside import SearchesInLine
@@ -304,9 +304,34 @@ def test_a_log_in_mcap_replays_the_same_poses_bit_for_bit(bank, printed, tmp_pat
         np.testing.assert_array_equal(one[3], other[3])
     with pytest.raises(OutputExistsError):
         open_sink(f"mcap:{log}", sensor)
-    log.write_bytes(log.read_bytes()[:200])
-    with pytest.raises(InputFileError, match="damaged"):
-        open_source(str(log), sensor)
+    whole = log.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 4
+    for damaged in (whole[:200], bytes(flipped)):
+        log.write_bytes(damaged)
+        with pytest.raises(InputFileError, match="damaged"):
+            open_source(str(log), sensor)
+    log.write_bytes(whole[:-30])  # of a session that was killed
+    with pytest.warns(UserWarning, match="cut off: the 22 messages of /frames before are read"):
+        cut: Any = open_source(str(log), sensor, in_time=False)
+    assert len(list(cut.recorded())) == 22
+
+
+def test_a_board_whose_first_line_comes_late_is_recognised(printed, monkeypatch):
+    """A port that resets its board when it is opened is silent at first, and is opened again."""
+    monkeypatch.setattr(sources, "STALLS_AFTER_S", 0.1)
+    read, write = os.pipe()
+    late = threading.Timer(0.15, os.write, (write, b"".join(printed[:4])))
+    source: Any = sources.PrintedSource(Stream("port", lambda: os.fdopen(os.dup(read), "rb", 0)), preset(SENSOR), {})
+    found: list[Any] = []
+    late.start()
+    for _ in range(3):
+        with pytest.raises(SourceFault, match="has sent nothing"):
+            found.extend(source.frames())
+    late.join()
+    os.close(write)
+    os.close(read)
+    assert (len(found), source.n_damaged) == (4, 0)
 
 
 def started(program, *words):

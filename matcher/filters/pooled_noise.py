@@ -29,9 +29,9 @@ def median_scaled(variance: _Float, freedom: _Float, law: _Float) -> tuple[_Floa
     -------
     variance : (n, pixels) float64
     overdispersion : (n,) float64
-        By how much χ² scatters more than under known noise: 1 / (8 m² f²) with the median m of χ² at the usual degrees
-        of freedom ν and its density f there, which is what the median of χ² over ν leaves unknown, however many pixels
-        there are.
+        By how much χ² scatters more than under known noise, for the median of χ² over ν leaves some of its size
+        unknown: 1 / (8 m² f²) with the median m of χ² at the usual degrees of freedom ν and its density f there,
+        however many pixels there are.
     """
     from scipy import special  # takes a fifth of a second
 

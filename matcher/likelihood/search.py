@@ -409,7 +409,7 @@ def _finished(
     settings = scene.settings() if scene.scout is None else _close_settings(scene, evidence)
     rival = None if most is None else most[again.frame]
     final = refine(scene.final, evidence, again, settings, rival=rival)
-    if starts is not None and explains is not None and scene.scout is not None and not setup.reports_one_surface:
+    if starts is not None and explains is not None and scene.scout is not None:
         promised = np.minimum(again.cost + DISAGREEMENT, explains[again.frame])
         lost = (again.cost <= explains[again.frame] + policy.close_cost) & (final.cost > promised)
         if lost.any():

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import time
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -20,6 +22,8 @@ from phasemark.render import Frames, Sensor
 
 _TOPICS = ("frames", "matches", "poses", "status")
 _LIBRARY = "phasemark"
+_MAGIC = b"\x89MCAP0\r\n"
+"""First and last bytes of a whole file."""
 
 
 class McapSink(Sink):
@@ -91,14 +95,23 @@ class McapSource(Replay):
 
     def _read(self, topic: str) -> list[dict[str, Any]]:
         reader = needed("mcap.reader", f"{self._path}", "mcap")
+        rows: list[dict[str, Any]] = []
         try:
             with open(self._path, "rb") as file:
-                messages = reader.make_reader(file).iter_messages(topics=[topic], log_time_order=False)
-                return [json.loads(message.data) for _, _, message in messages]
+                file.seek(-min(len(_MAGIC), self._path.stat().st_size), os.SEEK_END)
+                is_whole = file.read() == _MAGIC
+                file.seek(0)
+                of_kind = reader.SeekingReader if is_whole else reader.NonSeekingReader
+                messages = of_kind(file, validate_crcs=True).iter_messages(topics=[topic], log_time_order=False)
+                rows.extend(json.loads(message.data) for _, _, message in messages)
         except OSError as error:
             raise InputFileError(f"{self._path}: cannot be read ({error.strerror})") from None
         except Exception as error:  # whatever a damaged file makes mcap and json say
-            raise InputFileError(f"{self._path}: damaged, or no MCAP file ({str(error)[:120]})") from None
+            if not rows or is_whole or "crc" in str(error).lower():
+                raise InputFileError(f"{self._path}: damaged, or no MCAP file ({str(error)[:120]})") from None
+        if not is_whole:
+            warnings.warn(f"{self._path}: cut off: the {len(rows)} messages of {topic} before are read", stacklevel=2)
+        return rows
 
     def searches(self) -> dict[int, int]:
         """Return which earlier frame's full search was used with which frame."""

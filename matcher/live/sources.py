@@ -161,7 +161,8 @@ class PrintedSource(StreamSource):
     def _parsed(self, lines: Lines) -> Iterator[Arrival]:
         board = self._recognised(lines)
         if board is None:
-            yield from self._of_csv(lines)
+            if not (lines.fault or lines.is_stopped):
+                yield from self._of_csv(lines)
             return
         log = prints.BoardLog(cast(Any, lines), self._path, math.prod(self._shape), is_live=True)
         log.others = {other.name: other.line for other in BOARDS.values() if other.line is not board.line}
@@ -178,7 +179,7 @@ class PrintedSource(StreamSource):
             log.frame = None
 
     def _recognised(self, lines: Lines) -> Board | None:
-        """Return the board whose lines arrive, None of lines of CSV; the lines are then read again."""
+        """Return the board whose lines arrive, None of lines of CSV or where none arrive; the lines are read again."""
         if self._named is not None and self._named in BOARDS:
             return BOARDS[self._named]
         held: list[bytes] = []
