@@ -316,14 +316,45 @@ def test_wrong_arguments_end_in_one_line(options, message):
     assert "\n" not in str(raised.value)
 
 
-def test_data_of_a_model_with_other_geoms_is_refused():
-    scene = WALL + CAMERA + '<geom size=".1" pos="1 0 0"/>'
-    sensor, data = in_mujoco(scene)
-    sensor.read(data)
-    sensor.read(in_mujoco(scene)[1])  # of the same geoms
-    sensor.model.geom_size[0, 0] *= 2
+@pytest.mark.parametrize(
+    ("field", "albedo", "refused"),
+    [
+        ("geom_size", "rgba", True),
+        ("hfield_data", "rgba", True),
+        ("geom_rgba", "rgba", True),
+        ("geom_rgba", 0.5, False),  # colours may change where they are no albedos
+    ],
+)
+def test_data_of_a_model_with_other_geoms_is_refused(field, albedo, refused):
+    scene = (
+        '<asset><hfield name="h" nrow="3" ncol="3" size="1 1 1 .1"/></asset><worldbody>'
+        '<geom type="hfield" hfield="h" pos="2 0 -1"/><geom size=".1" pos="1 0 0"/>'
+        '<camera name="tof" xyaxes="0 -1 0 0 0 1"/></worldbody>'
+    )
+    sensors, data = [], []
+    for _ in range(2):
+        model = mujoco.MjModel.from_xml_string(f"<mujoco>{scene}</mujoco>")
+        sensors.append(TofSensor(model, camera="tof", albedo=albedo))
+        data.append(mujoco.MjData(model))
+        mujoco.mj_forward(model, data[-1])
+    sensors[0].read(data[0])
+    sensors[0].read(data[1])  # of the same geoms
+    getattr(sensors[0].model, field).flat[0] += 0.25
+    if not refused:
+        sensors[0].read(data[0])
+        return
     with pytest.raises(UsageError, match="with other geoms make another sensor"):
-        sensor.read(data)
+        sensors[0].read(data[0])
+
+
+def test_sensors_of_one_seed_on_other_cameras_have_other_noise():
+    back = CAMERA.replace('name="tof"', 'name="back"')
+    front, data = in_mujoco(CAMERA + back + WALL)
+    other = TofSensor(front.model, camera="back")
+    again = TofSensor(front.model, camera="tof")
+    ahead, behind, same = (sensor.read(data).histogram for sensor in (front, other, again))
+    assert np.array_equal(ahead, same)
+    assert not np.array_equal(ahead, behind)
 
 
 def test_what_cannot_be_rendered_is_named():

@@ -198,7 +198,7 @@ class TofSensor:
     rays : int, optional
         As for :class:`~phasemark.render.SceneRenderer`; None: exact.
     seed : int
-        Of the noise: the same readings for the same seed and states.
+        Of the noise: the same readings for the same seed and states. Sensors on other cameras or sites have others.
 
     Raises
     ------
@@ -230,10 +230,12 @@ class TofSensor:
         if not isinstance(groups, Iterable) or not set(groups) <= set(range(_GROUPS)):
             raise UsageError(f"'groups' must be numbers from 0 to {_GROUPS - 1}, got {groups!r}")
         self.model = model
-        self._layout = _layout(model)
+        self._has_colours = isinstance(albedo, str)
+        self._layout = _layout(model, self._has_colours)
         self.sensor = sensor if isinstance(sensor, Sensor) else preset(sensor)
         self._site = None if site is None else _number(model, "site", site)
         self._camera = None if camera is None else _number(model, "camera", camera)
+        self._stream = (0, self._camera or 0) if self._site is None else (1, self._site)
         self._exclude = -1 if exclude_body is None else _number(model, "body", exclude_body)
         self._groups = np.isin(np.arange(_GROUPS), groups).astype(np.uint8)
         self.seen = seen_model(model, albedo, self._exclude, groups, smooth)
@@ -286,10 +288,10 @@ class TofSensor:
             The data is of another model, or the model's geoms have changed since, a pose or the time is not finite, no
             pose has been computed yet, or the lens is inside a body.
         """
-        if not isinstance(data, mujoco.MjData) or _layout(data.model) != self._layout:
+        if not isinstance(data, mujoco.MjData) or _layout(data.model, self._has_colours) != self._layout:
             raise UsageError(
                 "'data' must be a mujoco.MjData of the sensor's model, as it was when the sensor was made: with other"
-                " geoms make another sensor"
+                " geoms make another sensor; with other terrain, meshes or colours too"
             )
         time_s = float(data.time)
         if not math.isfinite(time_s):
@@ -326,11 +328,11 @@ class TofSensor:
     def _reading(
         self, images: PhasorImages | HistogramImages, time_s: float, number: int, truth: TofTruth
     ) -> TofReading:
-        """Take one frame; its noise depends on the seed and the numbers of run and frame alone."""
+        """Take one frame; its noise depends on the seed, the camera or site, and the numbers of run and frame alone."""
         frames: HistogramFrames | Frames = capture(
             images,
             self.sensor,
-            rng=np.random.default_rng(self._seed),
+            rng=np.random.default_rng((self._seed, *self._stream)),
             first_view=self._run,
             first_frame=number,
         )
@@ -364,10 +366,17 @@ class TofSensor:
         return np.asarray(np.where(geom >= 0, distance, np.nan).reshape(self._cosine.shape) * self._cosine)
 
 
-def _layout(model: mujoco.MjModel) -> tuple[bytes, ...]:
-    """Return names and geoms: equal for models whose data is that of the same scene, as of one file compiled twice."""
-    geoms = ("bodyid", "type", "dataid", "size", "pos", "quat")
-    return model.names, *(getattr(model, f"geom_{name}").tobytes() for name in geoms)
+def _layout(model: mujoco.MjModel, with_colours: bool) -> tuple[bytes, ...]:
+    """Return names, geoms and their shapes: equal for models whose data is that of one scene, as of a file read twice.
+
+    Colours belong to it where albedos are made of them.
+    """
+    fields = ["bodyid", "type", "dataid", "size", "pos", "quat", "group"]
+    colours = ["geom_rgba", "geom_matid", "mat_rgba"] if with_colours else []
+    shapes = ["mesh_vert", "hfield_data", "hfield_size"]
+    return model.names, *(
+        getattr(model, name).tobytes() for name in (*(f"geom_{one}" for one in fields), *shapes, *colours)
+    )
 
 
 def _targets(frames: HistogramFrames) -> _Reported:
