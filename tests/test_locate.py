@@ -479,12 +479,18 @@ def test_a_sensor_that_repeats_itself_from_stop_to_stop_is_left_out(tmp_path):
     file.write_bytes(recording_bytes(recording, rig))
     again = read_rig_recording(file, rig)
     assert again.notes == ("", *["s1 is stuck"] * 5)
+    file.write_bytes(recording_bytes(replace(recording, odometry=None), rig))  # the others see other walls
+    assert read_rig_recording(file, rig).notes == again.notes
     answers = Locator(one, rig).locate(again, path, (0.2, 0.2, 0.2))
     assert sum(answer.accepted for answer in answers) >= 4
     assert all(np.hypot(*(answer.pose - true)[:2]) < 0.1 for answer, true in zip(answers, path, strict=True))
     around = path[0, 0], path[0, 1], math.pi - 1e-3  # a robot at rest sees the same again, and yaw may jump by a turn
     resting = replace(recording, odometry=np.array([[*around[:2], around[2] * (-1) ** k] for k in range(6)]))
     file.write_bytes(recording_bytes(resting, rig))
+    assert read_rig_recording(file, rig).notes == ("",) * 6
+    recording.depth_m[:] = recording.depth_m[:1] + np.random.default_rng(7).normal(0, 0.003, recording.depth_m.shape)
+    recording.depth_m[:, 0, 1] = recording.depth_m[0, 0, 1]
+    file.write_bytes(recording_bytes(replace(recording, odometry=None), rig))
     assert read_rig_recording(file, rig).notes == ("",) * 6
     track = np.column_stack([np.zeros(8), np.zeros(8), 0.03 * np.arange(8)])
     held = simulated_recording(one, rig, path[:1], np.random.default_rng(7), time_s=0.02 * np.arange(8), moved=track)

@@ -65,8 +65,10 @@ class RenderedModel(ImageModel):
         for name in bank.classes:
             mesh = bank.mesh(name)
             albedo = float(mesh.metadata["albedo"])
-            chip = ChipRenderer(mesh, bank.sensor, albedo=albedo) if reported else renderer_of(bank, mesh, albedo)
-            self._renderers.append(chip)
+            renderer = renderer_of(bank, mesh, albedo)
+            if reported:
+                renderer = ChipRenderer(mesh, bank.sensor, albedo=albedo, unsure_coverage=MAY_RETURN_COVERAGE)
+            self._renderers.append(renderer)
             vertices.append(np.asarray(mesh.vertices, np.float64))
         self._footprint = Footprint.of_vertices(np.concatenate(vertices))
         self._bank_end_m = float(bank.distance_m[-1])

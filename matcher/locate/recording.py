@@ -29,6 +29,8 @@ _FASTEST_M_S, _FASTEST_RAD_S = 5.0, 12.0
 """Odometry that moves faster between two frames has jumped."""
 _MOVED_M, _TURNED_RAD = 0.03, 0.05
 """While a robot moves by more, no sensor returns the same depths at each frame."""
+_OTHER_WALL_M = 0.1
+"""What a column sees changes by more where the robot has moved: noise and outliers of few columns do not."""
 FEWEST_TO_STICK, FEWEST_COLUMNS = 3, 3
 """Frames that must agree to the last digit before a sensor counts as stuck, and columns: one may repeat by chance."""
 HELD_S = 0.25
@@ -333,11 +335,14 @@ def _judged(recording: RigRecording, rig: Rig) -> RigRecording:
 
 
 def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
-    """Return which frames of which sensors, (n, F, S), repeat others though the odometry has moved."""
+    """Return which frames of which sensors, (n, F, S), repeat others though the robot has moved.
+
+    Odometry tells that; without it the other sensors, of which one sees other walls.
+    """
     (n, frames, sensors), poses, time_s = recording.depth_m.shape[:3], recording.moved, recording.time_s
-    series, stuck = np.arange(n), np.zeros((n, frames, sensors), np.bool_)
-    if recording.odometry is not None:  # else frames are compared within a stop alone
-        series, (yaw, moved) = recording.robot, (recording.odometry[:, None, 2], recording.moved)
+    series, stuck = recording.robot, np.zeros((n, frames, sensors), np.bool_)
+    if recording.odometry is not None:
+        yaw, moved = recording.odometry[:, None, 2], recording.moved
         x, y = (np.cos(yaw) * moved[..., k] + by * np.sin(yaw) * moved[..., 1 - k] for k, by in ((0, -1), (1, 1)))
         poses = recording.odometry[:, None] + np.stack([x, y, moved[..., 2]], axis=-1)
     for one in np.unique(series):
@@ -350,10 +355,21 @@ def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
             for run in np.flatnonzero(np.bincount(runs) >= FEWEST_TO_STICK):
                 where = own_k[runs == run], own_f[runs == run]
                 lasts = len(set(where[0])) > 1 or np.ptp(time_s[where]) > HELD_S
-                way = poses[where]
-                way[:, 2] = np.unwrap(way[:, 2])
-                stuck[*where, s] = lasts and has_moved(np.ptp(way, axis=0))
+                if recording.odometry is None:
+                    has_gone = _see_others(np.delete(recording.depth_m[where], s, axis=1))
+                else:
+                    way = poses[where]
+                    way[:, 2] = np.unwrap(way[:, 2])
+                    has_gone = bool(has_moved(np.ptp(way, axis=0)))
+                stuck[*where, s] = lasts and has_gone
     return stuck
+
+
+def _see_others(depth_m: _Float) -> bool:
+    """Return whether half of the columns of a sensor change by more than noise over frames, (frames, S, C)."""
+    span_m = np.fmax.reduce(depth_m) - np.fmin.reduce(depth_m)
+    known = np.isfinite(span_m).sum(axis=1)
+    return bool((2 * (span_m > _OTHER_WALL_M).sum(axis=1) > np.maximum(known, FEWEST_COLUMNS)).any())
 
 
 def same_depths(one: _Float, other: _Float) -> NDArray[np.bool_]:

@@ -49,6 +49,9 @@ class ChipRenderer(Renderer):
         With a [histogram] table.
     albedo : float
         Of the Lambertian landmark, in (0, 1].
+    unsure_coverage : float, optional
+        Coverage that zones have at most whose target may be reported and need not be: their phasor is then that of its
+        range. None: their phasor is 0.
 
     Raises
     ------
@@ -56,11 +59,13 @@ class ChipRenderer(Renderer):
         The sensor has no [histogram] table, or whatever :class:`~phasemark.render.Renderer` refuses.
     """
 
-    def __init__(self, mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8) -> None:
+    def __init__(
+        self, mesh: SurfaceMesh | None, sensor: Sensor, *, albedo: float = 0.8, unsure_coverage: float | None = None
+    ) -> None:
         if sensor.histogram is None:
             raise UsageError("the sensor has no [histogram] table: what its chip reports is not described")
         super().__init__(mesh, sensor, albedo=albedo, harmonics=())
-        self._signals = ViewSignals(mesh, sensor, self.albedo)
+        self._signals, self._unsure_coverage = ViewSignals(mesh, sensor, self.albedo), unsure_coverage
 
     def seen_by(self, sensor: Sensor) -> ChipRenderer:
         """Return a renderer of the same landmark for another direct sensor; see :meth:`Renderer.seen_by`."""
@@ -81,8 +86,9 @@ class ChipRenderer(Renderer):
         light = super().render_views(views, background=background, rows=rows, variant=variant, workers=workers)
         if variant != "exact":
             return light
-        range_m = self._reported_m(views, background, workers)[:, slice(*rows) if rows else slice(None)]
-        return self._with_ranges(light, range_m)
+        range_m, sure = self._reported(views, background, workers)
+        some = slice(*rows) if rows else slice(None)
+        return self._with_ranges(light, range_m[:, some], sure[:, some])
 
     def render_with_slopes(
         self,
@@ -100,7 +106,7 @@ class ChipRenderer(Renderer):
         check_parameters(parameters)
         if background is None:
             light, by_light = super().render_with_slopes(views, parameters, workers=workers)
-            image = self._with_ranges(light, self._reported_m(views, None, workers))
+            image = self._with_ranges(light, *self._reported(views, None, workers))
             lit = ((image.phasor != 0) & (light.phasor != 0))[:, None]
             along = np.divide(by_light, light.phasor[:, None], out=np.zeros_like(by_light), where=lit)
             return image, 1j * image.phasor[:, None] * along.imag
@@ -112,8 +118,9 @@ class ChipRenderer(Renderer):
         if isinstance(background, Sequence):
             behind = [own for own in background for _ in range(each)]
         moved = Views(*np.ascontiguousarray(about.T))
-        range_m = self._reported_m(moved, behind, workers).reshape(n, each, self.sensor.rows, self.sensor.cols)
-        image = self._with_ranges(light, range_m[:, 0])
+        range_m, sure = self._reported(moved, behind, workers)
+        range_m = range_m.reshape(n, each, self.sensor.rows, self.sensor.cols)
+        image = self._with_ranges(light, range_m[:, 0], sure.reshape(range_m.shape)[:, 0])
         slope = np.zeros((n, len(parameters), self.sensor.rows, self.sensor.cols), np.complex128)
         for k, name in enumerate(parameters):
             rise = range_m[:, 1 + 2 * k] - range_m[:, 2 + 2 * k]
@@ -121,23 +128,35 @@ class ChipRenderer(Renderer):
             slope[:, k] = 1j * image.phasor * by_parameter / self.sensor.metres_per_radian
         return image, slope
 
-    def _with_ranges(self, light: PhasorImages, range_m: NDArray[np.float64]) -> PhasorImages:
-        """Return images with the ranges that the chip reports, NaN where none is sure."""
+    def _with_ranges(self, light: PhasorImages, range_m: NDArray[np.float64], sure: NDArray[np.bool_]) -> PhasorImages:
+        """Return images with the ranges that the chip reports, or may report where it is not sure to."""
         turn = np.exp(1j * np.nan_to_num(range_m) / self.sensor.metres_per_radian)
-        return replace(light, phasor=np.where(np.isfinite(range_m), light.intensity * turn, 0.0))
+        image = replace(light, phasor=np.where(np.isfinite(range_m), light.intensity * turn, 0.0))
+        if self._unsure_coverage is None:
+            return image
+        return replace(
+            image, coverage=np.where(sure, image.coverage, np.minimum(image.coverage, self._unsure_coverage))
+        )
 
-    def _reported_m(self, views: Views, background: Backgrounds, workers: int) -> NDArray[np.float64]:
-        """Return the expected ranges of the nearest targets, NaN where none is sure to be reported; (n, rows, cols)."""
+    def _reported(
+        self, views: Views, background: Backgrounds, workers: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Return the expected ranges of the nearest targets, and which are sure to be reported; (n, rows, cols) each.
+
+        NaN where there is none, and unless coverage tells of those that are not sure, where none is.
+        """
         sensor = self.sensor
         found = expected_targets(detected_counts(self._signal(views, background, workers), sensor), sensor)
         distance = np.where(np.isfinite(found.distance_m), found.distance_m, np.inf)
         nearest = distance.argmin(axis=-1)[..., None]
         sure = np.take_along_axis(found.sure, nearest, axis=-1)[..., 0]
-        nearest_m = np.where(sure, np.take_along_axis(distance, nearest, axis=-1)[..., 0], np.nan)
+        nearest_m = np.take_along_axis(distance, nearest, axis=-1)[..., 0]
+        known = sure if self._unsure_coverage is None else np.isfinite(nearest_m)
+        nearest_m = np.where(known, nearest_m, np.nan)
         shape = (len(views), sensor.rows, sensor.cols)
         forward: Any = sensor.axis_cosine() if histogram_of(sensor).reports == "z" else 1.0
         offset = sensor.zone_offsets + sensor.range_offset_m  # taken off measured ranges before they are compared
-        return np.asarray(nearest_m.reshape(shape) / forward - offset)
+        return np.asarray(nearest_m.reshape(shape) / forward - offset), sure.reshape(shape)
 
     def _signal(self, views: Views, background: Backgrounds, workers: int) -> NDArray[np.float64]:
         """Return the expected signal counts of landmark and background, (n, zones, bins)."""
