@@ -88,7 +88,36 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
     if setup.bank.sensor.pixel_rad > WIDE_PIXEL_RAD and not (setup.unknown or setup.reports_one_surface):
         fits = _in_all_cells(scene, evidence, seen, fits)
     # 7  where the best fit would be accepted, look for rivals in all cells that are left
-    return _with_rivals(scene, evidence, seen, fits)
+    fits = _with_rivals(scene, evidence, seen, fits)
+    # 8  among the few zones of a chip, also along the valleys of the best fits
+    return _along_valleys(scene, evidence, fits) if setup.reports_one_surface else fits
+
+
+def _along_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
+    """Return fits with those along the weakest axes of rivals that only few zones contradict, of explained frames.
+
+    An edge of the landmark in the wrong zones costs as much as a rival, and no descent leads it across.
+    """
+    setup, n = scene.setup, len(evidence.weight)
+    explained = ~are_doubtful(setup, fits, n, setup.rules.false_alarm)
+    few_zones, most_rivals = 3 * DISAGREEMENT, 4
+    known = np.isfinite(fits.covariance).all(axis=(1, 2)) & explained[fits.frame]
+    near = np.flatnonzero(known & (fits.cost < least_of_frame(fits, n)[fits.frame] + few_zones))
+    near = distinct_of_frames(fits, near, setup.rules.symmetry, *_apart(scene))
+    near = near[np.lexsort((fits.cost[near], fits.frame[near]))]
+    frame = fits.frame[near]
+    rivals = fits[near[np.arange(len(near)) - np.searchsorted(frame, frame) < most_rivals]]
+    columns = [VIEW.index(name) for name in setup.free]
+    values, vectors = np.linalg.eigh(rivals.covariance)
+    axis = vectors[:, :, -1] * np.sqrt(np.maximum(values[:, -1:], 0.0))
+    parts = []
+    for size in (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0):
+        view = rivals.view.copy()
+        view[:, columns] += size * axis
+        parts.append(replace(rivals, view=view))
+    around = Fits.joined(parts)
+    best = least_of_frame(fits, n)[around.frame]
+    return Fits.joined([fits, refine(scene.final, evidence, around, _close_settings(scene, evidence), rival=best)])
 
 
 def _in_all_cells(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits) -> Fits:
