@@ -157,6 +157,15 @@ def test_standard_errors_are_those_of_repeated_fits():
         assert (pulls**2).sum() < high  # errors may be stated too large, never too small
 
 
+def test_a_pattern_from_nine_frames_is_not_made_larger_by_their_noise():
+    camera, n, pulls = PMD.with_(signal_e=3000.0, ambient_e=300.0, phase_offset_std_rad=0.01), 8, []
+    for seed in range(n):
+        one = fitted(camera, (1.0, 1.5, 2.0), 9, seed=seed, amplitude=False, intensity=False)
+        estimate = one.estimates["phase_offset_std_rad"]
+        pulls.append((estimate.value - camera_unit(camera).delay_rad[0].std(ddof=1)) / estimate.std_error)
+    assert abs(np.mean(pulls)) < stats.norm.ppf(1 - 1e-3 / 2) / math.sqrt(n)
+
+
 @pytest.mark.parametrize("n", [40, pytest.param(100, marks=pytest.mark.soak)])
 @pytest.mark.parametrize(
     ("given", "distances"),

@@ -137,8 +137,9 @@ def pixel_offsets(data: BoardData, found: Findings) -> tuple[Floats, Floats, Flo
     later = _range_error_m(truth / scale, delay + delay_step_rad, harmonics, sensor)
     slope = wrap_difference_m(later - model, sensor) / (delay_step_rad * scale)
     residual = wrap_difference_m(data.used([one.mean for one in data.error_m]) - model, sensor)
-    # without any noise every distance counts alike
-    weight = 1 / np.maximum(data.used(data.variance_m2) / data.used(data.n), 1e-18)
+    # a pixel's own variance of few frames is a poor weight; without any noise every distance counts alike
+    noise_m2 = np.mean(data.used(data.variance_m2) / data.used(data.n), axis=1, keepdims=True)
+    weight = np.broadcast_to(1 / np.maximum(noise_m2, 1e-18), truth.shape)
     information = (weight * slope**2).sum(axis=0)
     # a longer distance moves the phase as a delay does, and the truth as well
     moved = -weight * slope**2 * truth * (data.distance_std_m / data.distance_m)[:, None] / information
