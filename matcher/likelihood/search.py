@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -94,26 +95,30 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
 
 
 def _along_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
-    """Return fits with those along the weakest axes of rivals that only few zones contradict, of explained frames.
+    """Return fits with those along the two weakest axes of the best rivals of explained frames.
 
-    An edge of the landmark in the wrong zones costs as much as a rival, and no descent leads it across.
+    A column of zones on the wrong side of an edge costs more than most rivals, and no descent leads it across.
     """
     setup, n = scene.setup, len(evidence.weight)
     explained = ~are_doubtful(setup, fits, n, setup.rules.false_alarm)
-    few_zones, most_rivals = 3 * DISAGREEMENT, 4
+    most_rivals, a_column = 4, (setup.bank.sensor.rows + 1) * DISAGREEMENT
     known = np.isfinite(fits.covariance).all(axis=(1, 2)) & explained[fits.frame]
-    near = np.flatnonzero(known & (fits.cost < least_of_frame(fits, n)[fits.frame] + few_zones))
+    near = np.flatnonzero(known & (fits.cost < least_of_frame(fits, n)[fits.frame] + a_column))
     near = distinct_of_frames(fits, near, setup.rules.symmetry, *_apart(scene))
-    near = near[np.lexsort((fits.cost[near], fits.frame[near]))]
+    near = near[np.argsort(fits.cost[near], kind="stable")]
+    further = np.ones(len(near), np.bool_)  # all but the best of each class
+    further[np.unique(fits.frame[near] * len(setup.rules.names) + fits.class_index[near], return_index=True)[1]] = False
+    near = near[np.lexsort((fits.cost[near], further, fits.frame[near]))]
     frame = fits.frame[near]
     rivals = fits[near[np.arange(len(near)) - np.searchsorted(frame, frame) < most_rivals]]
-    columns = [VIEW.index(name) for name in setup.free]
+    p = fits.covariance.shape[1]
+    columns = [VIEW.index(name) for name in setup.free[:p]]
     values, vectors = np.linalg.eigh(rivals.covariance)
-    axis = vectors[:, :, -1] * np.sqrt(np.maximum(values[:, -1:], 0.0))
+    axes = vectors * np.sqrt(np.maximum(values, 0.0))[:, None]
     parts = []
-    for size in (-2.0, -1.0, -0.5, 0.5, 1.0, 2.0):
+    for k, size in itertools.product(range(max(p - 2, 0), p), (-1.0, -0.5, 0.5, 1.0)):
         view = rivals.view.copy()
-        view[:, columns] += size * axis
+        view[:, columns] += size * axes[:, :, k]
         parts.append(replace(rivals, view=view))
     around = Fits.joined(parts)
     best = least_of_frame(fits, n)[around.frame]
