@@ -301,7 +301,7 @@ class Matcher:
         if self.method == "nearest" and frames.tilts_rad.any():
             raise UsageError('frames with a tilt take method="refine": the images of a bank are level')
         found = self._method.match(self._with_noise(frames))
-        if guessed := _of_unknown_noise(frames, found):
+        if self._one is None and (guessed := _of_unknown_noise(frames, found)):
             again = self._method.match(self._with_noise(frames[guessed], [found[k] for k in guessed]))
             for k, answer in zip(guessed, again, strict=True):
                 found[k] = answer
@@ -387,7 +387,7 @@ class Matcher:
             return next(own, self._by_evidence[0]).track(frames, near)
         assert isinstance(self._method, LikelihoodMatcher)
         frames = self.read_out(frames).without_offset()
-        seen = near[:1] if _of_unknown_noise(frames, near[:1]) else ()
+        seen = near[:1] if self._one is None and _of_unknown_noise(frames, near[:1]) else ()
         found = self._method.track(self._with_noise(frames, seen), near)
         return with_parts(self._method.setup.rules, found, dict(near[0].systematic))
 

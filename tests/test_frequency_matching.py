@@ -33,6 +33,7 @@ from phasemark.render import (
     preset,
 )
 from phasemark.render.bench.fit.fit_sensor import fit_sensor
+from phasemark.render.unwrapped_frames import unwrap_frames
 
 PMD = preset("pmd-16x16")
 TWO = PMD.with_(modulation_hz=[20e6, 60e6])
@@ -168,6 +169,19 @@ def test_matching_reaches_the_bound_and_its_covariance_is_honest(bank, case):
         assert low < np.sum(ratio**2) < 1.3 * high  # the bound is local: slopes jump where edges cross pixel borders
     low, high = stats.chi2.interval(1 - 0.001 / 8, 3 * len(error))
     assert low < nees(error, matches.covariance[accepted]).sum() < slack * high
+
+
+@pytest.mark.parametrize("background", [None, WALL], ids=["alone", "wall"])
+def test_four_ranges_without_amplitudes_of_two_frequencies_have_an_honest_covariance(bank, background):
+    """Each frequency's noise is pooled before the ranges are unwrapped with it; NEES was 5.8 times too large."""
+    _, image = scene(bank, background)
+    frames = take(image, TWO, 4)
+    alone = unwrap_frames([Frames(one.range_m, flags=one.flags, sensor=one.sensor) for one in frames.by_frequency], TWO)
+    matches = Matcher(bank, "refine", free=VIEW[:3], background=background).match(kalman_filter(alone))
+    accepted = matches.accepted
+    assert accepted.mean() > 0.6
+    error = view_errors(matches, image.views, VIEW[:3], np.pi)[accepted]
+    assert nees(error, matches.covariance[accepted]).sum() < 1.3 * stats.chi2.ppf(0.999, 3 * len(error))
 
 
 @pytest.mark.parametrize("background", [None, pytest.param(WALL, marks=pytest.mark.soak)], ids=["alone", "wall"])

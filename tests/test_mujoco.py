@@ -340,6 +340,7 @@ def test_data_of_a_model_with_other_geoms_is_refused(field, albedo, refused):
     sensors[0].read(data[0])
     sensors[0].read(data[1])  # of the same geoms
     getattr(sensors[0].model, field).flat[0] += 0.25
+    data[0].time += 1.0  # another frame
     if not refused:
         sensors[0].read(data[0])
         return

@@ -226,6 +226,17 @@ class FilteredFrames:
         """
         if not self.std_from_scatter:
             return self
+        if self.by_frequency:  # ranges are unwrapped by the noise of each frequency
+            parts = [part.with_pooled_noise(light) for part in self.by_frequency]
+            more = [part.overdispersion for part in parts if part.overdispersion is not None]
+            whole = unwrap_filtered(parts, self.sensor)
+            return replace(
+                whole,
+                time_s=self.time_s,
+                tilt_rad=self.tilt_rad,
+                std_from_scatter=any(part.std_from_scatter for part in parts),
+                overdispersion=np.max(more, axis=0) if more else None,
+            )
         n, range_m = self.n_effective, np.nan_to_num(self.range_m, nan=1.0)
         law = assumed_std_m(range_m, self.sensor)
         if light is not None:
@@ -242,7 +253,6 @@ class FilteredFrames:
             std_m=np.where(n > 0, std, np.nan),
             std_from_scatter=False,
             overdispersion=overdispersion,
-            by_frequency=tuple(part.with_pooled_noise(light) for part in self.by_frequency),
         )
 
     def _repr_png_(self) -> bytes | None:

@@ -70,9 +70,11 @@ def moderated(variance: _Float, freedom: _Float, law: _Float) -> tuple[_Float, _
 
     found, more = law.copy(), np.zeros(len(law))
     halves = np.geomspace(0.05, 1e6, 400)
-    for k, told in enumerate(freedom > 0.5):
-        count = int(told.sum())
-        if count < 2:
+    for k, scattered in enumerate(freedom > 0.5):
+        told = scattered & (variance[k] > _LEAST * law[k])  # equal ranges are rounded or frozen, and tell no noise
+        if 2 * told.sum() < scattered.sum():
+            told = scattered
+        if told.sum() < 2:
             continue
         half = freedom[k, told] / 2
         logs = np.log(np.maximum(variance[k, told] / law[k, told], _LEAST)) - special.digamma(half) + np.log(half)

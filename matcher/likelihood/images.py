@@ -68,9 +68,11 @@ class ImageModel(ABC):
     ----------
     slopes_are_cheap : bool
         Whether slopes cost no more than images, as those of interpolated images do.
+    is_of_chip : bool
+        Whether pixels of a coverage of 0.005 need not report a target: they may contradict a frame, and are not fitted.
     """
 
-    slopes_are_cheap = True
+    slopes_are_cheap, is_of_chip = True, False
 
     def lit(self, factor: NDArray[np.float64]) -> ImageModel | None:
         """Return the model whose landmarks are brighter by factors (m,), one for each view.

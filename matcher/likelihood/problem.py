@@ -17,7 +17,7 @@ from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import TILT, VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
 
 LONGEST_STEP = 3.0
 """Longest step of a descent, in natural units of 1 cm and 1°."""
@@ -247,6 +247,8 @@ class Problem:
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64], share: float = 1.0) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels), or would with a share of the σ that they may have."""
         trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
+        if self.model.is_of_chip:  # a target that need not be reported jumps: it may only contradict
+            trusted = trusted & (images.coverage > MAY_RETURN_COVERAGE)
         phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides

@@ -56,7 +56,7 @@ class RenderedModel(ImageModel):
         splits_light: bool = False,
         reported: bool = False,
     ) -> None:
-        self._splits_light, self._reported = splits_light, reported
+        self._splits_light, self.is_of_chip = splits_light, reported
         self.sensor: Sensor = bank.sensor
         self.cache = ViewCache(cache_bytes)
         self._renderers = []
@@ -147,14 +147,14 @@ class RenderedModel(ImageModel):
         phasor, slope = np.empty((m, pixels), np.complex128), np.zeros((m, p, pixels), np.complex128)
         own_phasor, own_slope = np.empty_like(phasor), np.zeros_like(slope)  # of the landmark alone
         intensity, coverage = np.empty((m, pixels)), np.empty((m, pixels))
-        smooth = [name for name in free if name != "height_m" or self._reported]
+        smooth = [name for name in free if name != "height_m" or self.is_of_chip]
         for c in np.unique(class_index):
             of = np.flatnonzero(class_index == c)
             image, slopes, alone, alone_slopes = self._rendered(c, view[of], of, smooth, split=splits)
             phasor[of], own_phasor[of] = (one.phasor.reshape(len(of), -1) for one in (image, alone))
             intensity[of] = image.intensity.reshape(len(of), -1)
             # a chip need not see a surface that fills a zone at a slant, or far away
-            faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0) if self._reported else 1.0
+            faint = np.where(image.phasor == 0, MAY_RETURN_COVERAGE, 1.0) if self.is_of_chip else 1.0
             coverage[of] = np.minimum(image.coverage, faint).reshape(len(of), -1)
             for k, name in enumerate(free):
                 if name in smooth:

@@ -95,14 +95,21 @@ def search_views(scene: Scene, evidence: Evidence, seen: Observation, bare: NDAr
 
 
 def _along_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
-    """Return fits with those along the two weakest axes of the best rivals of explained frames.
+    """Return fits with those along the two weakest axes of the best rivals of answers that would be accepted.
 
     A column of zones on the wrong side of an edge costs more than most rivals, and no descent leads it across.
     """
     setup, n = scene.setup, len(evidence.weight)
-    explained = ~are_doubtful(setup, fits, n, setup.rules.false_alarm)
+    best = best_of_frame(fits)
+    best = best[[is_acceptable(setup.rules, fits, int(k)) for k in best]] if best.size else best
+    of_frame = np.full(n, -1)
+    of_frame[fits.frame[best]] = best
+    own = of_frame[fits.frame]
     most_rivals, a_column = 4, (setup.bank.sensor.rows + 1) * DISAGREEMENT
-    known = np.isfinite(fits.covariance).all(axis=(1, 2)) & explained[fits.frame]
+    apart_m = np.abs(fits.view[:, 0] - fits.view[own, 0]) > setup.rules.tolerance["distance_m"]
+    turn_rad = np.abs(np.angle(np.exp(1j * (fits.view[:, 1] - fits.view[own, 1]))))
+    other = (fits.class_index != fits.class_index[own]) | apart_m | (turn_rad > setup.rules.tolerance["delta_rad"])
+    known = np.isfinite(fits.covariance).all(axis=(1, 2)) & (own >= 0) & other
     near = np.flatnonzero(known & (fits.cost < least_of_frame(fits, n)[fits.frame] + a_column))
     near = distinct_of_frames(fits, near, setup.rules.symmetry, *_apart(scene))
     near = near[np.argsort(fits.cost[near], kind="stable")]
@@ -121,8 +128,8 @@ def _along_valleys(scene: Scene, evidence: Evidence, fits: Fits) -> Fits:
         view[:, columns] += size * axes[:, :, k]
         parts.append(replace(rivals, view=view))
     around = Fits.joined(parts)
-    best = least_of_frame(fits, n)[around.frame]
-    return Fits.joined([fits, refine(scene.final, evidence, around, _close_settings(scene, evidence), rival=best)])
+    rival = least_of_frame(fits, n)[around.frame]
+    return Fits.joined([fits, refine(scene.final, evidence, around, _close_settings(scene, evidence), rival=rival)])
 
 
 def _in_all_cells(scene: Scene, evidence: Evidence, seen: Observation, fits: Fits) -> Fits:

@@ -107,7 +107,7 @@ class McapSource(Replay):
         except OSError as error:
             raise InputFileError(f"{self._path}: cannot be read ({error.strerror})") from None
         except Exception as error:  # whatever a damaged file makes mcap and json say
-            if not rows or is_whole or "crc" in str(error).lower():
+            if (not rows and topic == "/frames") or is_whole or "crc" in str(error).lower():
                 raise InputFileError(f"{self._path}: damaged, or no MCAP file ({str(error)[:120]})") from None
         if not is_whole:
             warnings.warn(f"{self._path}: cut off: the {len(rows)} messages of {topic} before are read", stacklevel=2)

@@ -366,10 +366,16 @@ def _stuck(recording: RigRecording) -> NDArray[np.bool_]:
 
 
 def _see_others(depth_m: _Float) -> bool:
-    """Return whether half of the columns of a sensor change by more than noise over frames, (frames, S, C)."""
-    span_m = np.fmax.reduce(depth_m) - np.fmin.reduce(depth_m)
-    known = np.isfinite(span_m).sum(axis=1)
-    return bool((2 * (span_m > _OTHER_WALL_M).sum(axis=1) > np.maximum(known, FEWEST_COLUMNS)).any())
+    """Return whether half of the columns of a sensor change by more than noise, from the first to the last frames.
+
+    `depth_m` is (frames, S, C).
+    """
+    third = len(depth_m) // 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of columns without a depth
+        step_m = np.abs(np.nanmedian(depth_m[:third], axis=0) - np.nanmedian(depth_m[-third:], axis=0))
+    known = np.isfinite(step_m).sum(axis=1)
+    return bool((2 * (step_m > _OTHER_WALL_M).sum(axis=1) > np.maximum(known, FEWEST_COLUMNS)).any())
 
 
 def same_depths(one: _Float, other: _Float) -> NDArray[np.bool_]:

@@ -143,7 +143,7 @@ class ChipRenderer(Renderer):
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Return the expected ranges of the nearest targets, and which are sure to be reported; (n, rows, cols) each.
 
-        NaN where there is none, and unless coverage tells of those that are not sure, where none is.
+        NaN where there is none, and unless a coverage marks those that are not sure, where none is sure.
         """
         sensor = self.sensor
         found = expected_targets(detected_counts(self._signal(views, background, workers), sensor), sensor)

@@ -39,6 +39,11 @@ _NO_NORMALS = {"normal": None} if "normal:" in mujoco.mj_multiRay.__doc__ else {
 """Argument of rays since they can return normals."""
 _ON_TIME = 1e-6
 """Share of a period by which a sum of time steps may miss a multiple of it."""
+_OTHER_MODEL = (
+    "'data' must be a mujoco.MjData of the sensor's model, as it was when the sensor was made: with other geoms make"
+    " another sensor; with other terrain, meshes or colours too"
+)
+
 _Reported = tuple[NDArray[np.float64], NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]
 
 
@@ -231,7 +236,7 @@ class TofSensor:
             raise UsageError(f"'groups' must be numbers from 0 to {_GROUPS - 1}, got {groups!r}")
         self.model = model
         self._has_colours = isinstance(albedo, str)
-        self._layout = _layout(model, self._has_colours)
+        self._layout, self._shapes = _layout(model), _shapes(model, self._has_colours)
         self.sensor = sensor if isinstance(sensor, Sensor) else preset(sensor)
         self._site = None if site is None else _number(model, "site", site)
         self._camera = None if camera is None else _number(model, "camera", camera)
@@ -288,11 +293,8 @@ class TofSensor:
             The data is of another model, or the model's geoms have changed since, a pose or the time is not finite, no
             pose has been computed yet, or the lens is inside a body.
         """
-        if not isinstance(data, mujoco.MjData) or _layout(data.model, self._has_colours) != self._layout:
-            raise UsageError(
-                "'data' must be a mujoco.MjData of the sensor's model, as it was when the sensor was made: with other"
-                " geoms make another sensor; with other terrain, meshes or colours too"
-            )
+        if not isinstance(data, mujoco.MjData) or _layout(data.model) != self._layout:
+            raise UsageError(_OTHER_MODEL)
         time_s = float(data.time)
         if not math.isfinite(time_s):
             raise UsageError(f"the time of the data is {time_s}")
@@ -312,6 +314,8 @@ class TofSensor:
 
     def _expose(self, data: mujoco.MjData, numbers: range) -> dict[int, TofReading]:
         """Take frames of the present scene."""
+        if _shapes(data.model, self._has_colours) != self._shapes:
+            raise UsageError(_OTHER_MODEL)
         camera2world = self.camera2world(data)
         poses = self.seen.poses(data, camera2world[:3, 3])
         wrong = ~np.isfinite(poses).all(axis=(1, 2))
@@ -366,17 +370,17 @@ class TofSensor:
         return np.asarray(np.where(geom >= 0, distance, np.nan).reshape(self._cosine.shape) * self._cosine)
 
 
-def _layout(model: mujoco.MjModel, with_colours: bool) -> tuple[bytes, ...]:
-    """Return names, geoms and their shapes: equal for models whose data is that of one scene, as of a file read twice.
+def _layout(model: mujoco.MjModel) -> tuple[bytes, ...]:
+    """Return names and geoms: equal for models whose data is that of the same scene, as of one file compiled twice."""
+    geoms = ("bodyid", "type", "dataid", "size", "pos", "quat", "group")
+    return model.names, *(getattr(model, f"geom_{name}").tobytes() for name in geoms)
 
-    Colours belong to it where albedos are made of them.
-    """
-    fields = ["bodyid", "type", "dataid", "size", "pos", "quat", "group"]
-    colours = ["geom_rgba", "geom_matid", "mat_rgba"] if with_colours else []
-    shapes = ["mesh_vert", "hfield_data", "hfield_size"]
-    return model.names, *(
-        getattr(model, name).tobytes() for name in (*(f"geom_{one}" for one in fields), *shapes, *colours)
-    )
+
+def _shapes(model: mujoco.MjModel, with_colours: bool) -> tuple[bytes, ...]:
+    """Return meshes and terrain, and the colours where albedos are made of them."""
+    colours = ("geom_rgba", "geom_matid", "mat_rgba") if with_colours else ()
+    names = ("mesh_vert", "mesh_face", "hfield_data", "hfield_size", *colours)
+    return tuple(getattr(model, name).tobytes() for name in names)
 
 
 def _targets(frames: HistogramFrames) -> _Reported:
