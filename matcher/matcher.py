@@ -539,8 +539,13 @@ def _of_unknown_noise(frames: FilteredFrames, answers: Sequence[Match]) -> list[
     if frames.sensor.kind != "phase" or not frames.std_from_scatter or frames.amplitude_e is not None:
         return []
     enough = 50.0  # exposures of which the scatter of a pixel says as much as a law
+    hopeless = 20.0  # χ² over its degrees of freedom that no light of a landmark explains
     few = usual_count(frames) < enough
-    return [k for k, answer in enumerate(answers) if few[k] and answer.class_name is not None]
+    return [
+        k
+        for k, answer in enumerate(answers)
+        if few[k] and answer.class_name is not None and not answer.chi2 > hopeless * max(answer.dof, 1)
+    ]
 
 
 def _check_word(name: str, value: object, words: tuple[str, ...], before: str = "") -> None:
