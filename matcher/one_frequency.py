@@ -84,7 +84,7 @@ class OneFrequency:
             adc_bits=None,
             gain=1.0,
             black_level=0.0,
-            min_amplitude_e=0.0,
+            min_amplitude_e=camera.min_amplitude_e * more,
             max_phase_std_rad=None if limit is None else limit / math.sqrt(more),
         )
 

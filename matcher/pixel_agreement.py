@@ -23,7 +23,7 @@ from phasemark.render import Sensor, phasor_to_range_m, predicted_range_std
 DISAGREEMENT = 25.0
 """Cost of a pixel where frame and model disagree on whether anything returns: a residual of five σ."""
 MUST_RETURN_COVERAGE = 0.3
-"""A pixel that sees this much of the landmark must return something."""
+"""A pixel that sees this much of the landmark must return something, if its light is above what noise hides."""
 MAY_RETURN_COVERAGE = 0.005
 """A pixel that sees less of the landmark than this returns nothing, unless a background does."""
 FILLED_COVERAGE = 0.995
@@ -51,13 +51,13 @@ def counts(
     phasor, intensity : (..., rows, cols)
     sensor : Sensor
     share : float
-        Of the limit, in place of all of it.
+        Of the limit, in place of all of it: at half of it, twice the least amplitude must return.
 
     Returns
     -------
     (..., rows, cols) bool
-        Whether light returns and the noise law gives a range at most 0.1 rad (0.24 m at 10 MHz) of noise. A direct
-        sensor measures what returns at least `min_intensity` from within `max_range_m`.
+        Whether light returns, at `min_amplitude_e` or more, and the noise law gives a range at most 0.1 rad (0.24 m at
+        10 MHz) of noise. A direct sensor measures what returns at least `min_intensity` from within `max_range_m`.
     """
     amplitude = np.abs(phasor)
     lit = amplitude > 0
@@ -65,6 +65,8 @@ def counts(
         lit &= np.asarray(intensity) >= sensor.min_intensity
         if sensor.max_range_m is not None:
             lit &= np.where(lit, phasor_to_range_m(np.where(lit, phasor, 1.0), sensor), 0.0) <= sensor.max_range_m
+    elif sensor.min_amplitude_e > 0:
+        lit &= sensor.contrast * sensor.signal_e * amplitude >= sensor.min_amplitude_e / share
     std = predicted_range_std(amplitude, intensity, sensor)
     return np.asarray(lit & (std <= share * one_frame_limit_m(sensor) * (1 + _ROUNDING)))
 

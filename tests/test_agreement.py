@@ -210,6 +210,33 @@ def test_few_returns_determine_nothing_where_outliers_are_left_out(panel):
     assert robust.match(cut)[0].reason == "undetermined"
 
 
+DIM = {"signal_e": 1500.0, "ambient_e": 0.0, "read_noise_e": 15.0, "min_amplitude_e": 0.0}
+
+
+@pytest.mark.parametrize("dim", [DIM, {"min_amplitude_e": 8000.0}], ids=["noise", "threshold"])
+def test_pixels_that_may_go_dark_refuse_no_right_answer(tmp_path, dim):
+    mesh, _ = meshes()["bracket"]
+    mesh.export(tmp_path / "bracket.stl")
+    part = {"name": "bracket", "path": str(tmp_path / "bracket.stl"), "unit": "m", "origin": "center"}
+    plan = BankPlan(meshes=[part], sensor="pmd-16x16", sensor_overrides=dim, distance_m="0.6:1.3:0.02",
+                    delta_deg="0:358:2", layout="full")  # fmt: skip
+    with build_bank(plan, tmp_path / "dim.h5") as bank:
+        rng, n = np.random.default_rng(4), 48
+        renderer = Renderer(bank.mesh("bracket"), bank.sensor, albedo=0.8)
+        image = renderer.render(rng.uniform(0.7, 1.2, n), rng.uniform(0, 2 * np.pi, n))
+        some = counts(image.phasor, image.intensity, bank.sensor) & ~counts(
+            image.phasor, image.intensity, bank.sensor, 0.5
+        )
+        assert some.any(axis=(1, 2)).mean() > 0.5
+        frames = kalman_filter(capture(image, bank.sensor, rng=rng, n_frames=50))
+        matches = Matcher(bank, "refine", free=("distance_m", "delta_rad")).match(frames)
+    assert (matches.reason == "poor fit").sum() <= binom.ppf(0.999, n, 0.01)
+    assert matches.accepted.mean() > 0.75
+    error = np.column_stack([matches.distance_m - image.views.distance_m, matches.delta_rad - image.views.delta_rad])
+    assert (np.abs(error[matches.accepted, 0]) < GROSS_M).all()
+    assert (np.abs(np.angle(np.exp(1j * error[matches.accepted, 1]))) < GROSS_RAD).all()
+
+
 def test_a_landmark_beside_the_middle_is_matched_by_default_and_refused_where_the_bearing_is_fixed(thin_bank):
     bank = thin_bank("bracket", "pmd-16x16")
     frames = frames_of(bank, 1.1, 0.3, np.radians(2.5), seed=3, n_frames=20)

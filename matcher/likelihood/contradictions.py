@@ -16,7 +16,6 @@ from phasemark.matcher.pixel_agreement import (
     FILLED_COVERAGE,
     MAY_RETURN_COVERAGE,
     MUST_RETURN_COVERAGE,
-    SURELY,
     disagrees,
 )
 
@@ -39,7 +38,7 @@ def contradicted_pixels(
     # a kink nearby excuses a pixel where it keeps it from being compared
     trusted = problem.model.trusted(problem.class_index, view)
     # what is near the limit may return by its noise, or not, and contradicts nothing
-    sure = None if problem.settings.returns_behind is None else problem.pixels_at(state.images, state.theta, SURELY)
+    sure = problem.sure_pixels_at(state)
     wrong = _disagreeing(problem, state.images.coverage, sure) & trusted
     near, of = near[(wrong & among)[near].any(axis=1)], np.flatnonzero((wrong & among)[near].any(axis=1))
     if near.size:
@@ -47,12 +46,14 @@ def contradicted_pixels(
     return wrong & among
 
 
-def _disagreeing(problem: Problem, coverage: NDArray[np.float64], sure: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+def _disagreeing(problem: Problem, coverage: NDArray[np.float64], sure: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return which pixels return, or do not, against the coverages of candidates, (m, pixels)."""
     seen, behind = problem.evidence.seen, problem.settings.returns_behind
-    may, must = coverage >= MAY_RETURN_COVERAGE, coverage > MUST_RETURN_COVERAGE
-    if behind is not None and sure is not None:
-        may, must = may | problem.for_candidates(behind), sure
+    may, must = coverage >= MAY_RETURN_COVERAGE, sure
+    if behind is None:
+        must = must & (coverage > MUST_RETURN_COVERAGE)
+    else:
+        may = may | problem.for_candidates(behind)
     return disagrees(seen.returned[problem.frame], seen.not_returned[problem.frame], may, must)
 
 
@@ -63,7 +64,7 @@ def _fewest_wrong(
     covariance: NDArray[np.float64],
     trusted: NDArray[np.bool_],
     wrong: NDArray[np.bool_],
-    sure: NDArray[np.bool_] | None,
+    sure: NDArray[np.bool_],
 ) -> NDArray[np.bool_]:
     """Return which pixels the views around solutions contradict that contradict fewest, (k, pixels).
 
@@ -83,7 +84,7 @@ def _fewest_wrong(
         view[:, problem.columns[:p]] += np.einsum("npa,na->np", axes[own], tried)
         view = np.ascontiguousarray(problem.clipped(view, source))
         coverage = around.model.images(around.class_index, view, ()).coverage
-        there = _disagreeing(around, coverage, None if sure is None else sure[source]) & trusted[own]
+        there = _disagreeing(around, coverage, sure[source]) & trusted[own]
         distance2 = np.square(tried).sum(axis=1)
         total = np.where(distance2 <= 9.0, DISAGREEMENT * there.sum(axis=1) + distance2, np.inf).reshape(k, -1)
         best = total.argmin(axis=1)

@@ -17,7 +17,13 @@ from phasemark.matcher.information import NATURAL_UNITS
 from phasemark.matcher.likelihood.images import TILT, VIEW, ImageModel, ModelImages
 from phasemark.matcher.likelihood.residuals import Evidence, Sums, gauss_newton_sums
 from phasemark.matcher.likelihood.search_policy import DEFAULT_POLICY, SearchPolicy
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.pixel_agreement import (
+    DISAGREEMENT,
+    MAY_RETURN_COVERAGE,
+    MUST_RETURN_COVERAGE,
+    SURELY,
+    counts,
+)
 
 LONGEST_STEP = 3.0
 """Longest step of a descent, in natural units of 1 cm and 1°."""
@@ -244,11 +250,21 @@ class Problem:
         square = (self.prior_weight * rate**2)[:, :, None] * np.eye(p)
         return replace(sums, gradient=gradient, information=sums.information + square)
 
-    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64], share: float = 1.0) -> NDArray[np.bool_]:
-        """Return which pixels count at some views, (m, pixels), or would with a share of the σ that they may have."""
+    def sure_pixels_at(self, state: State) -> NDArray[np.bool_]:
+        """Return where noise hides no light of some states, (m, pixels)."""
+        images, sensor = state.images, self.evidence.sensor
+        return counts(images.phasor, images.intensity, sensor, SURELY) & self._trusted(images, state.theta)
+
+    def _trusted(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels the model computes as its sensor measures them, (m, pixels)."""
         trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
         if self.model.is_of_chip:  # a target that need not be reported jumps: it may only contradict
             trusted = trusted & (images.coverage > MAY_RETURN_COVERAGE)
+        return trusted
+
+    def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which pixels count at some views, (m, pixels)."""
+        trusted = self._trusted(images, theta)
         phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides
@@ -259,7 +275,7 @@ class Problem:
                     images.phasor, images.intensity, sensor
                 )
                 trusted = trusted & ~cancels
-        return counts(phasor, images.intensity, sensor, share) & trusted
+        return counts(phasor, images.intensity, sensor) & trusted
 
     def best_of_frames(self, state: State) -> NDArray[np.intp]:
         """Return the best candidate of each frame, in the order of the candidates, if its cost is within its limit."""

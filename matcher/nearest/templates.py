@@ -34,9 +34,10 @@ from phasemark.matcher.pixel_agreement import (
     MUST_RETURN_COVERAGE,
     PERHAPS,
     SURELY,
+    counts,
     disagrees,
 )
-from phasemark.render import PhasorImages, Sensor, phasor_to_range_m, predicted_range_std
+from phasemark.render import PhasorImages, Sensor, phasor_to_range_m
 from phasemark.render.phasor_images import wrap_difference_m
 
 _T = TypeVar("_T", bound=np.generic)
@@ -254,17 +255,17 @@ def seen_by_images(
     s = phasor.reshape(-1, pixels)
     cover = np.asarray(coverage).reshape(-1, pixels)
     may = cover >= MAY_RETURN_COVERAGE
-    must = cover > MUST_RETURN_COVERAGE
-    if background is not None:
+    if background is None:
+        must = counts(s, np.abs(s), sensor, SURELY) & (cover > MUST_RETURN_COVERAGE)
+    else:
         picked = slice(*rows)
         free = 1 - cover
         behind = free * background.phasor[0, picked].reshape(1, pixels)
         behind_intensity = free * background.intensity[0, picked].reshape(1, pixels)
+        may |= counts(behind, behind_intensity, sensor, PERHAPS)
+        intensity = np.abs(s) + behind_intensity
         s = s + behind.astype(np.complex64)
-        noise = predicted_range_std(np.abs(behind), behind_intensity, sensor) / sensor.metres_per_radian
-        limit = sensor.max_phase_std_rad or np.inf
-        may |= noise <= PERHAPS * limit
-        must |= noise <= SURELY * limit
+        must = counts(s, intensity, sensor, SURELY)
     may &= s != 0
     return np.where(may, phasor_to_range_m(s, sensor), 0.0), may, must
 
