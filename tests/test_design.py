@@ -46,7 +46,7 @@ from phasemark.matcher.design.measures import box_alone, upper_appearance
 from phasemark.matcher.design.search import Search
 from phasemark.matcher.design.shapes import Lattice, neighbours, sample_boxes, sample_uppers
 from phasemark.matcher.statistics import ratio_interval, rms_interval
-from phasemark.render import Renderer, Views, capture, preset
+from phasemark.render import Renderer, Views, capture, predicted_range_std, preset
 
 NEAR, FAR = 0.8, 2.0
 TAN = math.tan(math.radians(11))  # of the preset's half angle
@@ -246,7 +246,7 @@ def test_the_distance_of_two_classes_is_the_matchers_cost_without_noise(design):
     shifts = np.linspace(-0.02, 0.02, 401)
     others = renderer.render(distance + shifts, rows=(0, 8)).phasor.reshape(401, -1)
     ranges = sensor.metres_per_radian * np.angle(others)
-    both = (seen[0].weight[at] > 0) & (seen[1].coverage[at] >= 0.005)
+    both = (seen[0].weight[at] > 0) & seen[1].may[at]
     misfit = (seen[0].weight[at] * (seen[0].range_m[at] - ranges) ** 2)[:, both].sum(axis=1)
     for box_information in (1e4, 1e6):
         total = misfit + box_information * shifts**2
@@ -271,8 +271,11 @@ def test_confusion_follows_the_distance_of_classes():
     frames = capture(images[0], sensor, rng=np.random.default_rng(11), n_frames=50)
     filtered = kalman_filter(frames)
     returned = np.isfinite(filtered.range_m[:, :8]) & (seen[0].weight[-1] > 0).reshape(8, 16)
-    may = np.stack([(one.coverage[-1] >= 0.005).reshape(8, 16) for one in seen])
-    must = np.stack([(one.coverage[-1] > 0.3).reshape(8, 16) for one in seen])
+    upper = [image.coverage[0, :8] for image in images]
+    std = [predicted_range_std(np.abs(image.phasor[0, :8]), image.intensity[0, :8], sensor) for image in images]
+    may = np.stack([one >= 0.005 for one in upper])
+    sure_m = 0.05 * sensor.metres_per_radian
+    must = np.stack([(one > 0.3) & (own <= sure_m) for one, own in zip(upper, std, strict=True)])
     costs = []
     for k, image in enumerate(images):
         residual = (filtered.range_m - image.range_m)[:, :8] / filtered.std_m[:, :8]

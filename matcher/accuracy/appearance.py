@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from phasemark.matcher.one_frequency import phases_of
-from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, counts
+from phasemark.matcher.pixel_agreement import DISAGREEMENT, MAY_RETURN_COVERAGE, MUST_RETURN_COVERAGE, SURELY, counts
 from phasemark.render import Background, Renderer, Sensor, Views, phasor_to_range_m, predicted_range_std
 from phasemark.render.phasor_images import wrap_difference_m
 from phasemark.render.view import VIEW_FIELDS
@@ -36,14 +36,16 @@ class Appearance:
         1/σ² of the filtered range, m⁻²; 0 where one frame does not measure it to 0.1 rad.
     slope : (n, p, pixels) float64
         Of the range by the parameters that may differ.
-    coverage : float64
+    may, must : bool
+        Where light may return, and where it must.
     sensor : Sensor
     """
 
     range_m: NDArray[np.float64]
     weight: NDArray[np.float64]
     slope: NDArray[np.float64]
-    coverage: NDArray[np.float64]
+    may: NDArray[np.bool_]
+    must: NDArray[np.bool_]
     sensor: Sensor
 
     @classmethod
@@ -57,7 +59,7 @@ class Appearance:
         *,
         background: Background | None = None,
     ) -> Appearance:
-        """Render some rows of views, or all; where a background returns light, a pixel counts as covered."""
+        """Render some rows of views, or all; where a background is, all that returns light may and must."""
         sensor = renderer.sensor
         n = len(views)
 
@@ -66,8 +68,9 @@ class Appearance:
 
         image = renderer.render_views(views, background=background, rows=rows)
         s = image.phasor.reshape(n, -1)
-        seen = counts(s, image.intensity.reshape(n, -1), sensor) & (s != 0)
-        std = predicted_range_std(np.abs(s), image.intensity.reshape(n, -1), sensor)
+        intensity, coverage = image.intensity.reshape(n, -1), image.coverage.reshape(n, -1)
+        seen = counts(s, intensity, sensor)
+        std = predicted_range_std(np.abs(s), intensity, sensor)
         slopes = []
         for name in parameters:
             columns = {key: getattr(views, key) for key in VIEW_FIELDS}
@@ -79,7 +82,8 @@ class Appearance:
             np.where(s != 0, phasor_to_range_m(np.where(s != 0, s, 1.0), sensor), 0.0),
             np.divide(n_frames, std**2, out=np.zeros(std.shape), where=seen),
             np.stack(slopes, axis=1) if slopes else np.zeros((n, 0, s.shape[1])),
-            np.where((s != 0) & (background is not None), 1.0, image.coverage.reshape(n, -1)),
+            np.where(background is None, coverage >= MAY_RETURN_COVERAGE, s != 0),
+            counts(s, intensity, sensor, SURELY) & ((background is not None) | (coverage > MUST_RETURN_COVERAGE)),
             sensor,
         )
 
@@ -93,10 +97,9 @@ class Appearance:
             parameters.
         """
         returned = self.weight > 0
-        may, must = other.coverage >= MAY_RETURN_COVERAGE, other.coverage > MUST_RETURN_COVERAGE
-        weight = np.where(may, self.weight, 0.0)
+        weight = np.where(other.may, self.weight, 0.0)
         residual = wrap_difference_m(self.range_m - other.range_m, self.sensor)
-        penalty = DISAGREEMENT * ((returned & ~may) | (~returned & must)).sum(axis=-1)
+        penalty = DISAGREEMENT * ((returned & ~other.may) | (~returned & other.must)).sum(axis=-1)
         cost = (weight * residual**2).sum(axis=-1) + penalty
         weighted = weight[..., None, :] * other.slope
         gradient = (weighted * residual[..., None, :]).sum(axis=-1)
@@ -104,7 +107,8 @@ class Appearance:
 
     def __getitem__(self, which: slice | NDArray[np.integer]) -> Appearance:
         """Return some of the views; a single one is broadcast against others."""
-        return Appearance(self.range_m[which], self.weight[which], self.slope[which], self.coverage[which], self.sensor)
+        light = self.may[which], self.must[which]
+        return Appearance(self.range_m[which], self.weight[which], self.slope[which], *light, self.sensor)
 
 
 def least_cost(

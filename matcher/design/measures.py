@@ -170,7 +170,7 @@ class ClassDistances:
     @staticmethod
     def row(one: Appearance, others: Sequence[Appearance]) -> tuple[NDArray[np.float64], ...]:
         """Compare frames of one part with images of others, (m, n) each."""
-        names = ("range_m", "weight", "slope", "coverage")
+        names = ("range_m", "weight", "slope", "may", "must")
         stacked = {name: np.stack([getattr(other, name) for other in others]) for name in names}
         cost, gradient, information = one.imitated_by(Appearance(**stacked, sensor=one.sensor))
         return cost, gradient[..., 0], information[..., 0, 0]
