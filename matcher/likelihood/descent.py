@@ -148,8 +148,10 @@ def look_beside(problem: Problem, state: State) -> State:
     return state
 
 
-def settle(problem: Problem, state: State) -> State:
+def settle(problem: Problem, state: State, held: NDArray[np.integer]) -> State:
     """Move to better views nearby from those that contradict some pixels, and those that cost little more than a rival.
+
+    Those in `held` are moved too: their slopes lead to where a pixel is contradicted.
 
     Whether a pixel returns changes in a step where an edge enters it, which no slope shows. So views up to five
     standard deviations away along the axes of the covariance are tried, with the whole cost of PHYSICS section 7.
@@ -158,7 +160,7 @@ def settle(problem: Problem, state: State) -> State:
     near = problem.near_best(state, problem.policy.close_cost)
     settling_rounds = 3  # how often a view that contradicts some pixels is left for a better one nearby
     for _ in range(settling_rounds):
-        near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]))]
+        near = near[np.flatnonzero(contradicted[near] | (cost[near] > problem.rival[near]) | np.isin(near, held))]
         if not near.size:
             break
         moves = _moves(problem, state.sums, near)
@@ -180,6 +182,11 @@ def settle(problem: Problem, state: State) -> State:
         there = problem.some(near)
         found = descend(there, there.at(theta[at], with_slopes=True), SETTLED_COST)
         news, still = whole_cost(there, found)
+        lost = np.flatnonzero(news > total[chosen, best[chosen]])
+        if lost.size:  # slopes lead back to where a pixel is contradicted
+            back = problem.some(near[lost])
+            found.update(lost, back.at(theta[at[lost]], with_slopes=True))
+            news[lost], still[lost] = whole_cost(back, picked(found, lost))
         wins = np.flatnonzero(news < cost[near])
         state.update(near[wins], picked(found, wins))
         cost[near[wins]], contradicted[near[wins]] = news[wins], still[wins]

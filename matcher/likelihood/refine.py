@@ -93,7 +93,7 @@ def refine(
         state = look_beside(problem, state)
     state = _recounted(problem, state)
     if not model.slopes_are_cheap:  # interpolated coverages do not show the step in which an edge enters a pixel
-        state = settle(problem, state)
+        state = settle(problem, state, worse)
     return conclude(problem, state)
 
 

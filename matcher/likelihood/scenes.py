@@ -82,7 +82,7 @@ class Scene:
             unknown_around=setup.unknown,
             boards=setup.boards if setup.unknown else (),
             returns_behind=returns,
-            around=self.strips,
+            around=None if setup.reports_one_surface else self.strips,
             albedo_std=0.0 if behind is None else setup.albedo_std,
             policy=setup.policy,
         )
