@@ -1,5 +1,6 @@
 """Ranges that a chip reports: rendered, simulated, and matched before whatever stands behind the landmark."""
 
+import dataclasses
 import math
 from collections import Counter
 from functools import lru_cache
@@ -99,6 +100,26 @@ def test_zones_of_which_no_target_is_sure_do_not_make_another_part_likelier(
     assert match.reason in ("", "ambiguous")
     assert abs(match.distance_m - distance_m) < 0.03
     assert abs(math.remainder(match.delta_rad - math.radians(delta_deg), math.tau)) < math.radians(6)
+
+
+def test_a_view_whose_slopes_lead_to_where_a_zone_is_contradicted_is_left(angled):
+    name, distance_m = "l_mirrored", 0.8093923152221857
+    delta_rad, bearing_rad = math.radians(2.4427679333338537), math.radians(-0.8693698923468542)
+    view = Views.broadcast(distance_m, delta_rad, bearing_rad)
+    albedo = float(angled.mesh(name).metadata["albedo"])
+    images = HistogramRenderer(angled.mesh(name), angled.sensor, albedo=albedo).render_views(view)
+    frames = capture(images, angled.sensor, rng=np.random.default_rng(241982689062556403), n_frames=15).ranges
+    matcher, filtered = Matcher(angled, "refine", on="reported"), kalman_filter(frames)
+    expected = dataclasses.replace(
+        matcher.match(filtered)[0], class_name=name, bearing_rad=bearing_rad, pitch_rad=0.00113914, roll_rad=0.00412779
+    )
+    costs = [
+        matcher.track(
+            filtered, [dataclasses.replace(expected, distance_m=distance_m + near_m, delta_rad=delta_rad + turn_rad)]
+        ).chi2
+        for near_m, turn_rad in ((0.0, 0.0), (-1e-3, 3e-3))
+    ]
+    assert costs[1] < costs[0] + 9
 
 
 @pytest.mark.parametrize("name", sorted(catalog()))
