@@ -251,20 +251,17 @@ class Problem:
         return replace(sums, gradient=gradient, information=sums.information + square)
 
     def sure_pixels_at(self, state: State) -> NDArray[np.bool_]:
-        """Return where noise hides no light of some states, (m, pixels)."""
-        images, sensor = state.images, self.evidence.sensor
-        return counts(images.phasor, images.intensity, sensor, SURELY) & self._trusted(images, state.theta)
+        """Return where neither noise nor a threshold hides the light of some states, (m, pixels)."""
+        images = state.images
+        return counts(images.phasor, images.intensity, self.evidence.sensor, SURELY) & self._is_sure_target(images)
 
-    def _trusted(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return which pixels the model computes as its sensor measures them, (m, pixels)."""
-        trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN])
-        if self.model.is_of_chip:  # a target that need not be reported jumps: it may only contradict
-            trusted = trusted & (images.coverage > MAY_RETURN_COVERAGE)
-        return trusted
+    def _is_sure_target(self, images: ModelImages) -> NDArray[np.bool_] | np.bool_:
+        """Return where a chip must report its target: one that need not be reported jumps, and only contradicts."""
+        return images.coverage > MAY_RETURN_COVERAGE if self.model.is_of_chip else np.True_
 
     def pixels_at(self, images: ModelImages, theta: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return which pixels count at some views, (m, pixels)."""
-        trusted = self._trusted(images, theta)
+        trusted = self.model.trusted(self.class_index, theta[:, :ALBEDO_COLUMN]) & self._is_sure_target(images)
         phasor, sensor = images.phasor, self.evidence.sensor
         if self.with_albedo and images.slope.shape[1] == len(self.columns):
             # a landmark made dim must not make its pixels disappear: the bank's albedo decides
