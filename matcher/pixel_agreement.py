@@ -67,6 +67,8 @@ def counts(
             lit &= np.where(lit, phasor_to_range_m(np.where(lit, phasor, 1.0), sensor), 0.0) <= sensor.max_range_m
     elif sensor.min_amplitude_e > 0:
         lit &= sensor.contrast * sensor.signal_e * amplitude >= sensor.min_amplitude_e / share
+    if share > 1 and sensor.max_phase_std_rad is None:  # whatever its noise, all that is lit may return
+        return np.asarray(lit)
     std = predicted_range_std(amplitude, intensity, sensor)
     return np.asarray(lit & (std <= share * one_frame_limit_m(sensor) * (1 + _ROUNDING)))
 

@@ -15,6 +15,7 @@ from phasemark.data import BankPlan, build_bank, open_bank
 from phasemark.matcher import Matcher, kalman_filter
 from phasemark.matcher.filters.filtered_frames import PixelState
 from phasemark.matcher.likelihood.residuals import Evidence, gauss_newton_sums
+from phasemark.matcher.one_frequency import OneFrequency
 from phasemark.matcher.pixel_agreement import DISAGREEMENT, counts, disagrees
 from phasemark.render import Background, Frames, Renderer, Views, capture, preset
 
@@ -54,6 +55,23 @@ def test_a_direct_sensor_measures_nothing_beyond_its_range_or_below_its_intensit
     assert not counts(image.phasor, image.intensity, DIRECT.with_(min_intensity=0.3)).any()  # 0.5 / 1.5² = 0.22
     far = Renderer(None, DIRECT).render(1.0, background=Background(wall_m=4.5))
     assert not counts(far.phasor, far.intensity, DIRECT).any()
+
+
+@pytest.mark.parametrize("modulation_hz", [10e6, [20e6, 60e6]])
+def test_a_pixel_counts_from_the_least_amplitude_on(modulation_hz):
+    camera = preset("pmd-16x16").with_(min_amplitude_e=8000.0, modulation_hz=modulation_hz)
+    sensor = OneFrequency(camera, "combined").sensor if len(camera.frequencies_hz) > 1 else camera
+    least = 8000.0 / (camera.contrast * camera.signal_e)  # of |S|
+    s = least * np.array([0.499, 0.501, 0.999, 1.001, 1.999, 2.001])
+    for share, first in ((2.0, 1), (1.0, 3), (0.5, 5)):
+        np.testing.assert_array_equal(counts(s + 0j, s, sensor, share), np.arange(6) >= first)
+
+
+def test_without_a_limit_all_light_may_return_and_little_tells_nothing():
+    sensor = preset("pmd-16x16").with_(max_phase_std_rad=None)
+    s = np.array([0.0, 1e-6])
+    assert counts(s + 0j, s, sensor, 2.0).tolist() == [False, True]
+    assert not counts(s + 0j, s, sensor).any()
 
 
 def test_frame_and_model_disagree_where_the_table_says():
